@@ -38,11 +38,11 @@ class UpdateConfig:
     curiosity_steps: int = 100_000
     """Agent steps after which beta has decayed to 0, linearly."""
     scheme: Literal[1, 2, 3, 4, 5, 6] = 1
-    """Whose losses train the memory: 1 model and value, 2 value, 3 model, 4 all, 5 model and policy, 6 value and
-    policy (table 1 of the paper)."""
+    """Whose losses train the memory. 1: model and value, 2: value, 3: model, 4: all, 5: model and policy,
+    6: value and policy (table 1 of the paper)."""
     policy_through_q: bool = True
-    """In schemes 4 to 6: the policy's loss also reaches the memory by the state that Q reads, not by the policy's
-    own input alone."""
+    """In schemes 4 to 6 the policy's loss reaches the memory by the state that Q reads, too, not only by its own
+    input."""
     update_order: Literal["joint", "alternate"] = "joint"
     """joint: one step from all losses together. alternate: one loss after the other, each with an optimiser of its own
     (algorithm 1 as printed)."""

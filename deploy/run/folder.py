@@ -44,7 +44,7 @@ class RunFolder:
     """Names and small files of a run's folder."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path.resolve()
+        self.path = Path(os.path.realpath(path))  # unlike resolve, it takes a link to itself
         self.checkpoints, self.logs = self.path / "checkpoints", self.path / "logs"
         self.metrics = self.path / "metrics.jsonl"
         self.secret_file, self.result_file = self.path / "secret", self.path / "result.json"

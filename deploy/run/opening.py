@@ -205,6 +205,7 @@ def taken_up(folder: RunFolder, config: RunConfig, options: LaunchOptions) -> Ru
     folder.check_sizes(config.env.id, config.sizes())
     check_checkpoints(folder)
     _check_begun(folder, options)
+    folder.result()  # raises where it is damaged, before anything is written
     return before
 
 

@@ -41,7 +41,7 @@ def did_you_mean(word: str, known: Iterable[str], otherwise: str = "") -> str:
 def read_toml(option: str, path: Path, fix: str) -> dict[str, Any]:
     """What the file that ``option`` names holds. Raises ConfigError, with ``fix`` where no file can be read."""
     try:
-        return tomllib.loads(path.read_text())
+        return tomllib.loads(path.read_bytes().decode())
     except OSError as error:
         raise ConfigError(option, str(path), f"cannot be read ({error.strerror}); {fix}") from None
     except ValueError as error:  # no TOML, or no UTF-8

@@ -83,7 +83,7 @@ def check_ring_fits(config: RunConfig, options: LaunchOptions) -> None:
     def most(room: int) -> int:  # a run that goes on has a ring of this capacity for good
         return 0 if options.goes_on else max(0, capacity - -(-(size - room) // row))
 
-    free_disk = shutil.disk_usage(existing_parent((options.run_dir or Path("runs")).resolve())).free
+    free_disk = shutil.disk_usage(existing_parent((options.run_dir or Path("runs")).absolute())).free
     room = ring_bytes_there(config, options) + max(0, free_disk - DISK_RESERVE)
     if size > room:
         rest = f"{size_text(free_disk)} are free, {size_text(DISK_RESERVE)} of which are left for checkpoints and logs"

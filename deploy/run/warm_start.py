@@ -6,7 +6,6 @@ The learner takes a checkpoint up as ever; so does the one that is started again
 import io
 import json
 from dataclasses import dataclass, fields
-from pickle import UnpicklingError
 from typing import Any
 
 import safetensors.torch
@@ -26,7 +25,7 @@ from rmc.deploy.run.env_sizes import FLAGS
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import InitParts
 from rmc.deploy.run.option_names import option
-from rmc.learner.learner_checkpoint import LearnerProgress, pack
+from rmc.learner.learner_checkpoint import NOT_OURS, LearnerProgress, pack
 from rmc.learner.update import JointUpdate
 from rmc.learner.update_order import make_update
 
@@ -58,8 +57,8 @@ def prepare(config: RunConfig, init_from: str, parts: InitParts) -> InitialCheck
     Raises ConfigError where there is no such checkpoint, or its networks have other sizes.
     """
     folder, which = _split(init_from)
-    source = folder.config()
     try:
+        source = folder.config()
         number, files = choose_checkpoint(folder, which)
     except ConfigError as error:
         raise ConfigError(OPTION, init_from, error.fix) from None
@@ -68,7 +67,7 @@ def prepare(config: RunConfig, init_from: str, parts: InitParts) -> InitialCheck
         _check_sizes(init_from, parts, source, config, state["agent"])
         update = _begun(config, state, parts, bool(source.update.policy_ema_updates))
         progress = _progress(config.window_spec(), update.agent, json.loads(files[PROGRESS]), parts)
-    except (KeyError, RuntimeError, ValueError, EOFError, UnpicklingError) as error:
+    except NOT_OURS as error:
         fix = f"its checkpoint {number} cannot be used ({first_line(error)}); use another"
         raise ConfigError(OPTION, init_from, fix) from None
     weights = {name: value.contiguous() for name, value in update.average.policy_weights().items()}

@@ -42,7 +42,7 @@ def dry_run(config: RunConfig, options: LaunchOptions, console: Console) -> int:
     shorter = f"a warm-up of {trial.replay.warmup_steps:,} steps and a ring of {trial.replay.capacity:,} windows"
     console.print(f"a trial trains for {TRAINED_SECONDS:.0f} s in a temporary folder, with {shorter}", soft_wrap=True)
     evaluation.initial_policy(config)  # as a run's launcher does before it trains, whose memory this is
-    machine = this_machine((options.run_dir or Path("runs")).resolve())
+    machine = this_machine((options.run_dir or Path("runs")).absolute())
     with signals_caught() as stop:
         measured = run_trial(trial, options.device, stop)
     rows = needs(config, measured, machine, _there_already(config, options))

@@ -122,6 +122,8 @@ def _say_version() -> int:
 
 
 def _parse_and_run(words: list[str]) -> int:
+    if os.environ.get("NO_COLOR"):
+        os.environ["PYTHON_TYRO_ANSI_CODES"] = "False"  # read when tyro is imported
     from rmc.cli import parser
     from rmc.cli.config_file import option_values
     from rmc.common.bus.redis_url import warn_of_password, without_passwords
@@ -148,7 +150,8 @@ def _complaint(words: list[str]) -> str:
     """What is wrong with words that cannot be parsed; it quotes them."""
     from rmc.cli import complaint, parser
 
-    with contextlib.redirect_stderr(io.StringIO()) as stderr, contextlib.suppress(SystemExit):
+    plain = contextlib.redirect_stdout(io.StringIO())  # where it is a terminal, tyro has colours for both
+    with plain, contextlib.redirect_stderr(io.StringIO()) as stderr, contextlib.suppress(SystemExit):
         parser.parse(words)
     known = [word for word in words[:1] if word in parser.COMMANDS]
     all_options = "-all" * (known in (["train"], ["resume"]))

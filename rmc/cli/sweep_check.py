@@ -69,7 +69,8 @@ def _check(place: str, value: Any, spec: Spec, words: list[str]) -> None:
         parser.parse(["train", spec.env, *words])
         return
     told = [without_passwords(word) for word in words]  # the complaint quotes them
-    with contextlib.redirect_stderr(io.StringIO()) as output, contextlib.suppress(SystemExit):
+    plain = contextlib.redirect_stdout(io.StringIO())  # where it is a terminal, tyro has colours for both
+    with plain, contextlib.redirect_stderr(io.StringIO()) as output, contextlib.suppress(SystemExit):
         parser.parse(["train", spec.env, *told])
     raise ConfigError(place, value_without_passwords(value), complaint.as_line(output.getvalue(), ["sweep", *told]))
 
@@ -118,7 +119,8 @@ def _checked(job: Job, on_this_machine: bool) -> Checked:
     _check_file(command)
     config, options = command.config(), dataclasses.replace(command.launch_options(), run_dir=job.folder)
     validate(config)
-    validate_new(config)
+    if not options.goes_on:
+        validate_new(config)
     validate_launch(config, options)
     if on_this_machine:
         check_machine(config, options)

@@ -36,7 +36,7 @@ def check_disk(folder: Path, jobs: Sequence[Job], ring: int, at_once: int, dropp
     """Raises ConfigError where the rings of runs that have none yet are larger than the free disk."""
     new = sum(not RunFolder(job.folder).rings() for job in jobs)
     count = min(new, at_once) if dropped else new
-    free = shutil.disk_usage(existing_parent(folder.resolve())).free - DISK_RESERVE
+    free = shutil.disk_usage(existing_parent(folder.absolute())).free - DISK_RESERVE
     if count * ring > max(0, free):
         fix = f"{count} rings take {size_text(count * ring)}, {size_text(max(0, free))} are free; "
         way = "take fewer --jobs or a smaller capacity" if dropped else "take --drop-replay, or a smaller capacity"

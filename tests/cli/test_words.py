@@ -1,6 +1,10 @@
 """Options from a file, numbers as people write them, the two lengths of help."""
 
+import os
+import pty
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -110,6 +114,47 @@ def test_a_file_that_is_not_there_or_is_two(tmp_path: Path, file: Path) -> None:
     (tmp_path / "odd").write_bytes(b"\xff\xfe")
     with pytest.raises(ConfigError, match="is not TOML"):
         parser.parse(["train", "--config", str(tmp_path / "odd")])
+
+
+ON_A_TERMINAL = """
+import os, pty, sys
+os.dup2(pty.openpty()[1], 1)
+from rmc.cli import main
+sys.exit(main.run(sys.argv[1:]))
+"""
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["foo"], "Unrecognized options: foo (see rmc --help)"),
+        (["sweep", "Pendulum-v1", "--grid", "n_step=1.5"], "grid.n_step=1.5: "),
+    ],
+)
+def test_a_complaint_has_no_colours_on_a_terminal(words: list[str], line: str) -> None:
+    done = subprocess.run([sys.executable, "-c", ON_A_TERMINAL, *words], stderr=subprocess.PIPE, text=True, timeout=60)
+    assert done.stderr.startswith(f"rmc: {line}")
+    assert "\x1b" not in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_no_color_is_for_help_too() -> None:
+    terminal, other = pty.openpty()
+    words = [sys.executable, "-m", "rmc.cli.main", "completion", "--help"]
+    subprocess.run(words, stdout=other, env=os.environ | {"NO_COLOR": "1", "TERM": "xterm"}, timeout=60, check=True)
+    shown = os.read(terminal, 65_536).decode()
+    assert "usage: rmc completion" in shown
+    assert "\x1b" not in shown
+    for one in (terminal, other):
+        os.close(one)
+
+
+def test_a_file_is_utf_8_whatever_the_locale(tmp_path: Path) -> None:
+    (tmp_path / "options.toml").write_text('env = "Größe-v0"', encoding="utf-8")
+    code = "import sys; from pathlib import Path; from rmc.deploy.run.option_names import read_toml; "
+    code += "sys.exit(read_toml('--config', Path('options.toml'), '')['env'] != 'Gr\\xf6\\xdfe-v0')"
+    plain = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=os.environ | plain, timeout=60, check=True)
 
 
 @pytest.mark.parametrize("word", ["1000000", "1_000_000", "1e6", "1.0E6", "+1000000"])

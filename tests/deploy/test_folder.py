@@ -401,6 +401,12 @@ def test_odd_files_are_named_in_one_line(
         assert str(tmp_path) in line
 
 
+@pytest.mark.parametrize("words", [["stats"], ["resume"], ["stop"], ["train", "Pendulum-v1", "--run-dir"]])
+def test_a_link_to_itself_is_one_line(words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "loop").symlink_to("loop")
+    assert "loop" in complaint([*words, str(tmp_path / "loop")], capsys)
+
+
 def test_a_baseline_is_not_filmed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "config.json").write_text(BASELINE)
     line = complaint(["evaluate", str(tmp_path), "--video", "x.mp4"], capsys)

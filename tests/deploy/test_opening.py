@@ -156,6 +156,14 @@ def test_a_folder_that_shows_what_another_run_has_is_left_alone(link: str, tmp_p
     assert kept.read_text() == "of value"
 
 
+def test_a_start_that_a_damaged_result_refuses_changes_nothing(folder: RunFolder) -> None:
+    folder.result_file.write_text("{")
+    before = folder.config(), folder.history_file.read_bytes()
+    with pytest.raises(ConfigError, match=r"result\.json"):
+        open_run(with_value(CONFIG, "total_steps", 9_000), LaunchOptions(folder.path))
+    assert (folder.config(), folder.history_file.read_bytes()) == before
+
+
 def test_what_was_edited_to_another_kind_is_as_by_default(folder: RunFolder) -> None:
     (line,) = folder.history_file.read_text().splitlines()
     edited = {"metrics_port": "9464", "device": 5, "launcher": "locla", "all_cpus": True, "run_dir": "elsewhere"}

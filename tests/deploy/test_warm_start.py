@@ -230,10 +230,18 @@ def test_what_makes_no_difference_to_the_parts_says_nothing(
     assert not caplog.records
 
 
-def test_a_state_that_is_cut_is_one_line(source: RunFolder, tmp_path: Path) -> None:
+def saved(value: Any) -> bytes:
+    """As a state's file."""
+    written = io.BytesIO()
+    torch.save(value, written)
+    return written.getvalue()
+
+
+@pytest.mark.parametrize("state", [b"PK", saved([1]), saved({"agent": None})], ids=["cut", "a list", "no agent"])
+def test_a_state_that_is_none_is_one_line(state: bytes, tmp_path: Path) -> None:
     copied = untrained(tmp_path / "copied", CONFIG)
     progress = json.dumps({"updates": 5, "env_steps": 50}).encode()
-    CheckpointFolder(copied.checkpoints).save(5, {"learner.pt": b"PK", "progress.json": progress})
+    CheckpointFolder(copied.checkpoints).save(5, {"learner.pt": state, "progress.json": progress})
     message = r"--init-from='.*copied': its checkpoint 5 cannot be used \(.+\); use another"
     with pytest.raises(ConfigError, match=message):
         begin(OTHER, tmp_path / "run", copied)

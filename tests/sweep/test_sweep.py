@@ -318,6 +318,15 @@ def test_the_environment_is_made_once_for_all_seeds(tmp_path: Path, monkeypatch:
     assert len({one.config.window_spec() for one in checked}) == len(made) == 1
 
 
+def test_a_run_that_is_there_goes_on_with_what_a_new_one_has_no_use_for(tmp_path: Path) -> None:
+    words = ("train", "InvertedPendulum-v5", "--preset", "debug", "--flicker-burst", "5")
+    with pytest.raises(ConfigError, match="--flicker-burst"):
+        check_jobs([Job(tmp_path / "run", words, 0)], on_this_machine=True)
+    folder = untrained(tmp_path / "run", read_job(Job(Path(), words[:4], 0))[0])
+    folder.write_config(read_job(Job(Path(), words, 0))[0])
+    assert check_jobs([Job(tmp_path / "run", words, 0)], on_this_machine=True)[0].config.env.flicker_burst == 5.0
+
+
 def made(folder: Path, gamma: float = 0.99) -> Job:
     """A run that is over."""
     words = ("train", "InvertedPendulum-v5", "--preset", "debug", "--gamma", str(gamma), "--seed", "0")
