@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 from tests.command import rmc
-from tests.docs.running import LOCKSTEP
 
 FEWER = {
     'seeds = "1-2"': "seeds = 1", "--seeds 1-2": "--seeds 1", "--trials 2": "--trials 1", "=3e-4,1e-3": "=1e-3",
@@ -26,8 +25,7 @@ def test_its_commands_run(tmp_path: Path) -> None:
     on_ray = [command for command in commands if "--launcher ray" in command]
     assert len(on_ray) == 1
     for command in (one for one in commands if one not in on_ray):
-        words = [*command.split()[1:], *(LOCKSTEP if "--preset debug" in command else ())]
-        done = rmc(*words, cwd=tmp_path, timeout=300)
+        done = rmc(*command.split()[1:], cwd=tmp_path, timeout=300)
         assert (done.returncode, done.stderr) == (0, ""), f"{command}\n{done.stdout}{done.stderr}"
     runs = {path.parent.name: len(path.read_text().splitlines()) for path in tmp_path.glob("runs/*/sweep.jsonl")}
     assert runs == {"InvertedPendulum-v5__sweep": 1, "rates": 2, "search": 1}
