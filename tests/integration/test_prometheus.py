@@ -74,10 +74,10 @@ def test_a_run_is_scraped_its_alerts_fire_and_the_dashboard_has_data(tmp_path: P
     port, alerts = free_port(), (MONITOR / "alerts.yaml").read_text()
     sooner = alerts.replace("rmc_silent_seconds > 60", "rmc_silent_seconds > 5")
     assert sooner != alerts
-    options = ("--total-steps", "1000000", "--metrics-port", str(port))
+    options = ("--total-steps", "1000000", "--checkpoint-steps", "200", "--metrics-port", str(port))
     with (
         Prometheus(tmp_path / "prometheus", f"{HERE}:{port}", sooner) as prometheus,
-        Training(tmp_path / "run", *options, env="Pendulum-v1") as training,
+        Training(tmp_path / "run", *options, env="tests.slow_env:Slow-v0") as training,
     ):
         training.wait_for(lambda: prometheus.values("rmc_evaluation_return"))
         actor = training.role("actor")
