@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from rmc.cli.parser import COMMANDS, option_names
 from rmc.deploy.run.option_names import did_you_mean, option
 
+SAYS_ON_OR_OFF = re.compile("true|false|yes|no|on|off", re.IGNORECASE)
 ENDS = ("For full helptext", "Argument helptext", "Arguments are applied", "Perhaps you meant", "Available subcommands")
 
 
@@ -16,7 +17,19 @@ def as_line(boxed: str, words: Sequence[str]) -> str:
     ends = [i for i, row in enumerate(body) if row.startswith(ENDS)]
     heading = 1 if len(body) > 1 else 0
     message = " ".join(body[heading : ends[0] if ends else None])
-    return re.sub(r" \(applied to rmc[\w -]*\)", "", message) + _near(words)
+    message = re.sub(r" \(applied to rmc[\w -]*\)", "", message)
+    return message + (_switch(message, words) or _near(words))
+
+
+def _switch(message: str, words: Sequence[str]) -> str:
+    """Of an option that takes no value, and was given one that says on or off; else nothing."""
+    for word, after in zip(words, [*words[1:], ""], strict=True):
+        flag, equals, value = word.partition("=")
+        value = value if equals else after
+        if flag.startswith("--") and SAYS_ON_OR_OFF.fullmatch(value) and message == f"Unrecognized options: {value}":
+            name = flag.removeprefix("--").removeprefix("no-")
+            return f"; write --{name} or --no-{name}, without a value"
+    return ""
 
 
 def _near(words: Sequence[str]) -> str:

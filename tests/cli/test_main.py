@@ -121,6 +121,14 @@ def test_the_flags_are_these(command: str, expected: list[str], capsys: pytest.C
             "Unrecognized options: --episods, 3; did you mean --episodes? (see rmc evaluate --help)",
         ),
         ("train X --zzzz", "Unrecognized options: --zzzz (see rmc train --help-all)"),
+        *(
+            (
+                f"train X {option}",
+                "Unrecognized options: False; write --grounding or --no-grounding, without a value "
+                "(see rmc train --help-all)",
+            )
+            for option in ("--grounding=False", "--no-grounding False")
+        ),
         ("trian X", "Unrecognized options: trian, X; did you mean train? (see rmc --help)"),
         (
             "resume x --if-exists new",
