@@ -22,12 +22,13 @@ def threads_fight(vitals: Vitals, config: RunConfig) -> Finding | None:
     if not cores:
         return None
     threads, busy = threads_of_learner(vitals, config, cores), busy_threads(vitals, config, cores)
+    on_cores = f"on {cores} core{'s' * (cores > 1)}"
     if threads > cores:
-        measured = f"the learner has {threads} threads on {cores} cores"
+        measured = f"the learner has {threads} threads {on_cores}"
         return Finding("threads fight", measured, f"--threads {max(1, cores - 1)} leaves one to the other roles")
     if busy <= CROWDED * cores or (free_cores(vitals) or 0.0) > IDLE_CORES * cores:
         return None
-    measured = f"{busy:.1f} threads of the run are busy at a time, on {cores} cores"
+    measured = f"{busy:.1f} threads of the run are busy at a time, {on_cores}"
     fewer = max(1, int(cores - busy + threads))
     if fewer < threads:
         return Finding("threads fight", measured, f"--threads {fewer} in place of {threads} would fit")

@@ -1,6 +1,7 @@
 """Whether this machine can do it, asked before anything starts: the ring, the device, the cores."""
 
 import errno
+import math
 import os
 import re
 import shutil
@@ -51,9 +52,10 @@ def listening(
 
 
 def check_learner(config: RunConfig, device: str) -> None:
-    """Raises ConfigError where the device is not there, or a CPU's memory holds no batch."""
+    """Raises ConfigError where the device is not there, or a CPU's memory holds no networks or no batch."""
     check_device(device)
     if device == "cpu":
+        check_networks_fit(config)
         check_batch_fits(config)
 
 
@@ -93,6 +95,18 @@ def check_ring_fits(config: RunConfig, options: LaunchOptions) -> None:
     if size > memory:
         fix = f"take at most {most(memory)}" if most(memory) else "take a machine with more"
         raise ConfigError("--capacity", capacity, f"takes {size_text(size)} of {size_text(memory)} memory; {fix}")
+
+
+def check_networks_fit(config: RunConfig) -> None:
+    """Raises ConfigError where the networks are larger than the free memory, by the least that they can take.
+
+    That is each weight, its gradient and Adam's two moments, of the GRU's square matrices and the heads' second layers.
+    """
+    hidden, heads, memory = config.agent.hidden, config.agent.heads, free_memory()
+    for name, value, weights in (("--hidden", hidden, 3 * hidden**2), ("--heads", heads, 4 * math.prod(heads))):
+        if (needed := 4 * 4 * weights) > memory:
+            fault = f"its weights take {size_text(needed)} of {size_text(memory)} free memory in training"
+            raise ConfigError(name, value, f"{fault}; take fewer units")
 
 
 def check_batch_fits(config: RunConfig) -> None:

@@ -6,6 +6,7 @@ import re
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import psutil
 import pytest
@@ -22,6 +23,7 @@ from rmc.deploy.run.preflight import (
     DISK_RESERVE,
     check_batch_fits,
     check_device,
+    check_learner,
     check_machine,
     check_ring_fits,
     ring_bytes,
@@ -57,6 +59,15 @@ def test_a_batch_of_long_windows_that_no_memory_holds_is_refused_with_the_larges
         check_batch_fits(run(990, most + 1))
     with pytest.raises(ConfigError, match="take fewer steps a window"):
         check_batch_fits(dataclasses.replace(run(9_990, 1), agent=AgentConfig(hidden=4_096)))
+
+
+@pytest.mark.parametrize(("agent", "named"), [({"hidden": 65_536}, "--hidden"), ({"heads": (400_000, 9)}, "--heads")])
+def test_networks_that_no_memory_holds_are_refused(agent: dict[str, Any], named: str, memory: int) -> None:
+    config = run(15, 8)
+    check_learner(config, "cpu")
+    config = dataclasses.replace(config, agent=dataclasses.replace(config.agent, **agent))
+    with pytest.raises(ConfigError, match=f"^{named}=.* of 200.0 MB free memory in training; take fewer units$"):
+        check_learner(config, "cpu")
 
 
 def test_a_run_that_goes_on_is_offered_no_capacity_that_it_would_refuse(memory: int, tmp_path: Path) -> None:
