@@ -1,5 +1,6 @@
 """What the parser says of words that it cannot read."""
 
+import itertools
 import re
 from collections.abc import Sequence
 
@@ -23,7 +24,7 @@ def as_line(boxed: str, words: Sequence[str]) -> str:
 
 def _switch(message: str, words: Sequence[str]) -> str:
     """Of an option that takes no value, and was given one that says on or off; else nothing."""
-    for word, after in zip(words, [*words[1:], ""], strict=True):
+    for word, after in itertools.zip_longest(words, words[1:], fillvalue=""):
         flag, equals, value = word.partition("=")
         value = value if equals else after
         if flag.startswith("--") and SAYS_ON_OR_OFF.fullmatch(value) and message == f"Unrecognized options: {value}":
