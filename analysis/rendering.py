@@ -83,7 +83,7 @@ def probe(env: str, import_path: str) -> None:
     try:
         environment = make_env(EnvConfig(**json.loads(env)), render=True)
         environment.reset(seed=0)
-        frame(environment)
+        rendered_frame(environment)
         environment.close()
     except EnvFault as fault:
         if fault.__cause__ is not None and _is_renderers(fault.__cause__):
@@ -100,7 +100,7 @@ def _is_renderers(error: BaseException) -> bool:
     return any(set(parts) & RENDERERS and "site-packages" in parts for parts in files)
 
 
-def frame(env: Env, shape: tuple[int, ...] | None = None) -> NDArray[np.uint8]:
+def rendered_frame(env: Env, shape: tuple[int, ...] | None = None) -> NDArray[np.uint8]:
     """(height, width, 3), both even, as the codec wants them. Raises EnvFault where it is no picture of that shape."""
     frame = np.asarray(env.render())
     if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8 or min(frame.shape) < 2:

@@ -9,7 +9,7 @@ from pathlib import Path
 from rmc.actors.evaluator import first_start, longest_episode
 from rmc.analysis.out_file import check_writable
 from rmc.analysis.policy import Policy
-from rmc.analysis.rendering import PICTURE, choose_backend, frame
+from rmc.analysis.rendering import PICTURE, choose_backend, rendered_frame
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.faults import call_env
 from rmc.common.env.make import make_env
@@ -63,13 +63,13 @@ def record(policy: Policy, env_config: EnvConfig, seed: int, out: Path, longest:
     with closing(make_env(env_config, render=True)) as env:
         _follow(env)
         observation, info = env.reset(seed=first_start(seed, final=True))
-        size = frame(env).shape
+        size = rendered_frame(env).shape
         rate = (env.metadata.get("render_fps") or FRAMES_PER_SECOND) / env_config.action_repeat  # a frame an action
         with written_whole(out) as path, _told(out):
             with closing(write_frames(str(path), (size[1], size[0]), fps=rate, macro_block_size=1)) as video:
                 video.send(None)  # the generator's start
                 for _ in range(min(longest, longest_episode(env))):
-                    video.send(frame(env, size).tobytes())
+                    video.send(rendered_frame(env, size).tobytes())
                     action = policy.act(observation, info.get("missing", False))
                     observation, reward, terminated, truncated, info = env.step(action)
                     total += float(reward)

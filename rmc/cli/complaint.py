@@ -1,14 +1,24 @@
 """What the parser says of words that it cannot read."""
 
+import contextlib
+import io
 import itertools
 import re
 from collections.abc import Sequence
 
-from rmc.cli.parser import COMMANDS, option_names
+from rmc.cli.parser import COMMANDS, option_names, parse
 from rmc.deploy.run.option_names import did_you_mean, option
 
 SAYS_ON_OR_OFF = re.compile("true|false|yes|no|on|off", re.IGNORECASE)
 ENDS = ("For full helptext", "Argument helptext", "Arguments are applied", "Perhaps you meant", "Available subcommands")
+
+
+def about(words: Sequence[str], named: Sequence[str]) -> str:
+    """What is wrong with words that cannot be parsed, in a line that quotes them; ``named`` begin with the command."""
+    plain = contextlib.redirect_stdout(io.StringIO())  # where it is a terminal, tyro has colours for both
+    with plain, contextlib.redirect_stderr(io.StringIO()) as stderr, contextlib.suppress(SystemExit):
+        parse(list(words))
+    return as_line(stderr.getvalue(), named)
 
 
 def as_line(boxed: str, words: Sequence[str]) -> str:

@@ -150,12 +150,9 @@ def _complaint(words: list[str]) -> str:
     """What is wrong with words that cannot be parsed; it quotes them."""
     from rmc.cli import complaint, parser
 
-    plain = contextlib.redirect_stdout(io.StringIO())  # where it is a terminal, tyro has colours for both
-    with plain, contextlib.redirect_stderr(io.StringIO()) as stderr, contextlib.suppress(SystemExit):
-        parser.parse(words)
     known = [word for word in words[:1] if word in parser.COMMANDS]
     all_options = "-all" * (known in (["train"], ["resume"]))
-    return f"{complaint.as_line(stderr.getvalue(), words)} (see {' '.join(['rmc', *known])} --help{all_options})"
+    return f"{complaint.about(words, words)} (see {' '.join(['rmc', *known])} --help{all_options})"
 
 
 def _complain(message: str, status: int) -> int:

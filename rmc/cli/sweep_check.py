@@ -69,10 +69,8 @@ def _check(place: str, value: Any, spec: Spec, words: list[str]) -> None:
         parser.parse(["train", spec.env, *words])
         return
     told = [without_passwords(word) for word in words]  # the complaint quotes them
-    plain = contextlib.redirect_stdout(io.StringIO())  # where it is a terminal, tyro has colours for both
-    with plain, contextlib.redirect_stderr(io.StringIO()) as output, contextlib.suppress(SystemExit):
-        parser.parse(["train", spec.env, *told])
-    raise ConfigError(place, value_without_passwords(value), complaint.as_line(output.getvalue(), ["sweep", *told]))
+    fault = complaint.about(["train", spec.env, *told], ["sweep", *told])
+    raise ConfigError(place, value_without_passwords(value), fault)
 
 
 def check_jobs(jobs: Sequence[Job], on_this_machine: bool) -> list[Checked]:
