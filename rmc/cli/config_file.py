@@ -24,19 +24,12 @@ def with_file(words: list[str], names: Sequence[str]) -> tuple[list[str], str]:
 
     ``names`` are those of all options. Raises ConfigError.
     """
-    path = _named(words)
+    path = named(words)
     if path is None:
         return words, ""
-    options = plain_names(f"{OPTION} {path}: ", read_toml(OPTION, path, "give a TOML file"), RENAMED)
-    env, kwargs = options.pop("env", ""), options.pop("env_kwargs", {})
-    if not isinstance(env, str):
-        raise ConfigError(f"{OPTION} {path}: env", env, 'write the environment\'s id, like env = "HalfCheetah-v5"')
-    if not isinstance(kwargs, dict):
-        raise ConfigError(f"{OPTION} {path}: env_kwargs", kwargs, "write a table, like env_kwargs = { goal = 1.5 }")
-    for name, value in options.items():
-        _check(path, name, value, names)
+    env, options = read_options(path, names)
+    kwargs = options.pop("env_kwargs", {})
     file_words = [word for name, value in options.items() for word in option_words(name, value)]
-    check_kwargs(kwargs)
     if any(word.partition("=")[0].replace("_", "-") == KWARGS for word in words):
         kwargs = {}
     last = [KWARGS, *write_kwargs(kwargs)] if kwargs else []
@@ -45,11 +38,39 @@ def with_file(words: list[str], names: Sequence[str]) -> tuple[list[str], str]:
     return [words[0], *first, *file_words, *own[len(first) :], *last], env
 
 
-def _named(words: Sequence[str]) -> Path | None:
-    named = [user_path(value) for value in option_values(OPTION, words)]
-    if len(named) > 1:
-        raise ConfigError(OPTION, " ".join(map(str, named)), "is there twice; give one file")
-    return named[0] if named else None
+def named(words: Sequence[str]) -> Path | None:
+    """The file, if there is one. Raises ConfigError where there are two."""
+    paths = [user_path(value) for value in option_values(OPTION, words)]
+    if len(paths) > 1:
+        raise ConfigError(OPTION, " ".join(map(str, paths)), "is there twice; give one file")
+    return paths[0] if paths else None
+
+
+def without_file(words: Sequence[str]) -> list[str]:
+    """The words that do not name it."""
+    kept, left = [], iter(words)
+    for word in left:
+        name, equals, _ = word.partition("=")
+        if name != OPTION:
+            kept.append(word)
+        elif not equals:
+            next(left, None)
+    return kept
+
+
+def read_options(path: Path, names: Sequence[str]) -> tuple[str, dict[str, Any]]:
+    """The file's ENV, and its options by their names in Python. Raises ConfigError."""
+    options = plain_names(f"{OPTION} {path}: ", read_toml(OPTION, path, "give a TOML file"), RENAMED)
+    env, kwargs = options.pop("env", ""), options.get("env_kwargs", {})
+    if not isinstance(env, str):
+        raise ConfigError(f"{OPTION} {path}: env", env, 'write the environment\'s id, like env = "HalfCheetah-v5"')
+    if not isinstance(kwargs, dict):
+        raise ConfigError(f"{OPTION} {path}: env_kwargs", kwargs, "write a table, like env_kwargs = { goal = 1.5 }")
+    check_kwargs(kwargs)
+    for name, value in options.items():
+        if name != "env_kwargs":
+            _check(path, name, value, names)
+    return env, options
 
 
 def option_values(option: str, words: Sequence[str]) -> list[str]:

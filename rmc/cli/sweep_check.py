@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rmc.cli import complaint, parser
+from rmc.cli import complaint, config_file, parser
 from rmc.cli.train_options import Train
 from rmc.common.bus.redis_url import value_without_passwords, without_passwords
 from rmc.common.errors import ConfigError
@@ -19,12 +19,11 @@ from rmc.deploy.run.preflight import check_machine
 from rmc.deploy.run.tracking import choose_tracking
 from rmc.deploy.run.validation import validate, validate_launch, validate_new
 from rmc.sweep.job import Job
-from rmc.sweep.spec import Range, Spec, check_name
+from rmc.sweep.spec import EVERY_RUNS, Range, Spec, check_name
 
 RESERVED = (
     "run_dir", "if_exists", "redis_url", "ray_address", "all_cpus", "tls", "metrics_port", "metrics_host", "dry_run",
 )  # fmt: skip
-FILES = ("--config", "--init-from")  # that the nodes of a cluster do not have
 
 
 @dataclass(frozen=True)
@@ -36,14 +35,34 @@ class Checked:
     options: LaunchOptions
 
 
+def with_file(spec: Spec) -> Spec:
+    """The sweep with the options of the file of ``--config``, read once: runs may start when it says something else.
+
+    Raises ConfigError.
+    """
+    path = config_file.named(spec.words)
+    if path is None:
+        return spec
+    words, said = config_file.without_file(spec.words), []
+    ranges = spec.search.ranges if spec.search is not None else {}
+    own = {word.partition("=")[0].replace("_", "-") for word in words}.union(
+        map(option, (*spec.options, *spec.grid, *ranges))
+    )
+    for name, value in config_file.read_options(path, parser.option_names(Train))[1].items():
+        check_name(f"{config_file.OPTION} {path}: {name}", name, value, EVERY_RUNS)
+        if option(name) not in own:
+            said += option_words(name, value)
+    return dataclasses.replace(spec, words=(*said, *words))
+
+
 def check_values(spec: Spec, on_this_machine: bool) -> None:
     """Raises ConfigError, which names the key, for the first value that rmc train would not read."""
     given = {word.partition("=")[0].replace("_", "-") for word in spec.words}
     typed = " ".join(map(without_passwords, spec.words))
     ranges = spec.search.ranges if spec.search is not None else {}
     named = given | {option(name) for name in (*spec.options, *spec.grid, *ranges)}
-    if not on_this_machine and (files := named.intersection(FILES)):
-        raise ConfigError(min(files), typed, "the nodes do not have that file; leave it")
+    if not on_this_machine and "--init-from" in named:
+        raise ConfigError("--init-from", typed, "the nodes do not have that file; leave it")
     if "--seed" in given:
         raise ConfigError("--seed", typed, "a sweep has several: give --seeds")
     for name in RESERVED:
@@ -53,8 +72,6 @@ def check_values(spec: Spec, on_this_machine: bool) -> None:
     for name, sought in ranges.items():
         if isinstance(sought, Range):
             is_integer(name, read_job(Job(Path(), ("train", spec.env, *spec.words), 0))[0])
-    if option("config") in given and (seed := parser.parse(["train", spec.env, *spec.words]).seed):
-        raise ConfigError("--seed", seed, "a sweep has several: give --seeds, and leave it out of that file")
     for part, values in (("options", {name: [value] for name, value in spec.options.items()}), ("grid", spec.grid)):
         for name, tried in values.items():
             for value in tried:
@@ -114,7 +131,6 @@ def as_planned(job: Job, config: RunConfig, options: LaunchOptions) -> Job:
 
 def _checked(job: Job, on_this_machine: bool) -> Checked:
     command = parser.parse(list(job.words))
-    _check_file(command)
     config, options = command.config(), dataclasses.replace(command.launch_options(), run_dir=job.folder)
     validate(config)
     if not options.goes_on:
@@ -132,17 +148,6 @@ def _checked(job: Job, on_this_machine: bool) -> Checked:
 
         warm_start.prepare(config, options.init_from, options.init_parts)
     return Checked(job, config, options)
-
-
-def _check_file(command: Train) -> None:
-    """Raises ConfigError for what the file of ``--config`` says, and a sweep's runs are not given."""
-    defaults = {item.name: item.default for item in dataclasses.fields(Train)}
-    for name in RESERVED:
-        if (value := getattr(command, name)) != defaults[name]:
-            raise ConfigError(
-                option(name), value_without_passwords(value), "a sweep's runs are given none; leave it out of that file"
-            )
-    check_name(option("launcher"), "launcher", command.launcher)
 
 
 def is_integer(name: str, config: RunConfig) -> bool:

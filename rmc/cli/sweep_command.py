@@ -38,7 +38,7 @@ log = logging.getLogger(__name__)
 def sweep(command: Sweep) -> int:
     """Run what is missing of a sweep; 130 where it was stopped, 1 where a run has failed or was stopped."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
-    spec, folder = read_sweep(command), command.sweep_dir or default_folder(command.what)
+    spec, folder = sweep_check.with_file(read_sweep(command)), command.sweep_dir or default_folder(command.what)
     if (folder / "config.json").exists():
         raise ConfigError("--sweep-dir", str(folder), "is a run's folder; give another")
     if command.jobs < 0:

@@ -204,7 +204,6 @@ def test_an_option_that_a_table_names_twice_is_refused(table: str, tmp_path: Pat
         ([PENDULUM, "--grid", "scheme=1,2", "--scheme", "3"], "scheme=[1, 2]: is an option of every run"),
         ([PENDULUM, "--grid", "grounding=true,false", "--no-grounding"], "grounding=[True, False]: is an option"),
         ([PENDULUM, "--jobs", "-1"], "--jobs=-1: take 1 or more"),
-        ([PENDULUM, "--config", "f.toml", "--launcher", "ray"], "--config='--config f.toml': the nodes do not"),
         (
             [PENDULUM, "--init_from", "runs/a", "--launcher", "ray"],
             "--init-from='--init_from runs/a': the nodes do not have that file",
@@ -248,8 +247,25 @@ def test_what_a_sweeps_runs_are_not_given_is_refused_in_the_file_of_config_too(
     monkeypatch.chdir(tmp_path)
     Path("base.toml").write_text(f'preset = "debug"\n{line}\n')
     assert main.run(["sweep", PENDULUM, "--config", "base.toml"]) == 2
-    _one_line(capsys, f"--{line.split()[0].replace('_', '-')}=")
+    _one_line(capsys, f"--config base.toml: {line.split()[0]}=")
     assert os.listdir() == ["base.toml"]
+
+
+def test_the_file_of_config_is_read_once_and_what_the_sweep_says_wins(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    file = 'env = "Ant-v5"\npreset = "debug"\ngamma = 0.9\nheads = [4, 4]\nn_step = 2\nenv_kwargs = {a = 1}\n'
+    Path("base.toml").write_text(file)
+    Path("spec.toml").write_text(f'env = "{PENDULUM}"\n[options]\ngamma = 0.95\n[grid]\nn_step = [3, 4]\n')
+    typed = ["--heads", "8", "8", "--config", "base.toml", "--actors", "1", "--env_kwargs", "b=2"]
+    spec = sweep_check.with_file(spec_of("spec.toml", *typed))
+    Path("base.toml").unlink()
+    configs = [sweep_check.read_job(job)[0] for job in grid_jobs(spec, tmp_path)]
+    assert [config.update.n_step for config in configs] == [3, 4]
+    for config in configs:
+        assert (config.preset, config.update.gamma, config.agent.heads, config.actors) == ("debug", 0.95, (8, 8), 1)
+        assert (config.env.id, config.env.env_kwargs) == (PENDULUM, {"b": 2})
 
 
 def _one_line(capsys: pytest.CaptureFixture[str], message: str) -> None:
