@@ -15,7 +15,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from rmc.common.errors import CheckpointError, ConfigError
-from rmc.common.process.file_lock import take_lock
+from rmc.common.process.file_lock import release_lock, take_lock
 from rmc.common.whole_file import write_synced, write_whole
 
 STATE, POLICY, PROGRESS = "learner.pt", "policy.safetensors", "progress.json"
@@ -50,7 +50,7 @@ class CheckpointFolder:
     def unlock(self) -> None:
         """Let another writer in."""
         if self._lock is not None:
-            os.close(self._lock)
+            release_lock(self._lock)
             self._lock = None
 
     def numbers(self) -> list[int]:

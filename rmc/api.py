@@ -134,7 +134,8 @@ class _Callback:
             self.error = error
             if signal.getsignal(signal.SIGINT) is None:  # it goes to a program around Python, which may do anything
                 raise
-            signal.raise_signal(signal.SIGINT)
+            ignored = signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+            signal.raise_signal(signal.SIGTERM if ignored else signal.SIGINT)
 
 
 def _train(config: RunConfig, options: LaunchOptions, callback: Callback | None) -> dict[str, Any]:

@@ -1,5 +1,7 @@
 """The client of a bus: what Redis answers in error names the command and its keys, and is waited out or told."""
 
+import socket
+import ssl
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -66,6 +68,20 @@ class _Pipeline(Pipeline):
 
     def annotate_exception(self, exception: Any, _: int, command: Any) -> None:
         _name(exception, tuple(command))
+
+
+class TlsConnection(redis.SSLConnection):
+    """Trusts the certificates that the URL names, and no others of this machine beside them."""
+
+    def _wrap_socket_with_ssl(self, sock: socket.socket) -> ssl.SSLSocket:
+        if self.ca_certs is None:
+            return super()._wrap_socket_with_ssl(sock)  # type: ignore[no-any-return, no-untyped-call]
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+        context.check_hostname, context.verify_mode = self.check_hostname, self.cert_reqs
+        context.load_verify_locations(self.ca_certs)
+        if self.certfile is not None:
+            context.load_cert_chain(self.certfile, self.keyfile, self.certificate_password)
+        return context.wrap_socket(sock, server_hostname=self.host)
 
 
 class RedisClient(redis.Redis):

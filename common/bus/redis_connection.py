@@ -7,17 +7,22 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from typing import Any, TypeVar
+from urllib.parse import parse_qs, urlsplit
 
 import redis
 from redis.backoff import ExponentialBackoff
 from redis.retry import Retry
 
-from rmc.common.bus.redis_client import RedisClient, refusal
+from rmc.common.bus.redis_client import RedisClient, TlsConnection, refusal
 from rmc.common.bus.redis_url import HIDDEN, fault, redacted
 from rmc.common.errors import BusUnavailable, ConfigError
 
 TIMEOUT_SECONDS = 3.0  # that Redis may take for an answer; two of them are less than a learner waits for a batch
-TIMEOUTS, TIMEOUT_LIMIT = ("socket_timeout", "socket_connect_timeout"), 1e6  # that a URL may name; seconds
+TIMEOUTS, TIMEOUT_LIMIT = {"socket_timeout", "socket_connect_timeout"}, 1e6  # that a URL may name; seconds
+OPTIONS = TIMEOUTS | {  # that may follow its question mark; others change what an answer is
+    "db", "username", "password", "client_name", "health_check_interval", "socket_keepalive", "ssl_ca_certs",
+    "ssl_certfile", "ssl_keyfile", "ssl_password", "ssl_cert_reqs", "ssl_check_hostname",
+}  # fmt: skip
 INTEGER = re.compile(rb"-?[0-9]{1,18}")
 T = TypeVar("T")
 
@@ -36,11 +41,14 @@ class RedisConnection:
         if fix := fault(url):
             raise ConfigError("--redis-url", redacted(url), fix)
         try:
+            if not parse_qs(urlsplit(url).query, keep_blank_values=True).keys() <= OPTIONS:
+                raise ValueError
+            encrypted = {"connection_class": TlsConnection} if url.startswith("rediss:") else {}
             self.redis: Any = RedisClient.from_url(  # Any: its annotations do not know decode_responses
-                url, retry=retry, socket_timeout=TIMEOUT_SECONDS
+                url, retry=retry, socket_timeout=TIMEOUT_SECONDS, **encrypted
             )
             pool = self.redis.connection_pool
-            pool.connection_class(**pool.connection_kwargs)  # knows what may stand behind the question mark
+            pool.connection_class(**pool.connection_kwargs)  # knows what their values may be
             if not all(0 < pool.connection_kwargs.get(name, 1) < TIMEOUT_LIMIT for name in TIMEOUTS):
                 raise ValueError
         except (ValueError, TypeError, redis.exceptions.RedisError):  # whose words may quote a password
@@ -82,6 +90,11 @@ class RedisConnection:
         except redis.exceptions.TimeoutError as error:
             self._rests_until = time.monotonic() + TIMEOUT_SECONDS  # half of the time is for what needs no Redis
             raise BusUnavailable(str(error)) from None
+        except redis.exceptions.InvalidResponse:  # whose words are the other end's
+            self.redis.connection_pool.disconnect()
+            raise BusUnavailable("what answers is no Redis") from None
+        except UnicodeError:
+            raise BusUnavailable("its host has an impossible name") from None
         except (redis.exceptions.ConnectionError, OSError) as error:
             raise BusUnavailable(str(error)) from None
 

@@ -11,7 +11,8 @@ from rmc.common.errors import BusUnavailable, FencedError, MessageError
 
 KINDS = ("weights", "evaluate")  # of policies: what acts, and what is evaluated
 PIECE_BYTES = 256 * 1024  # 10 MB blobs collapse redis-py; pieces of this size run at memory speed
-PIECES = 4096  # of a policy, at most: 1 GiB
+PIECES = 4096  # of a policy, at most
+LARGEST_BYTES = PIECES * PIECE_BYTES  # 1 GiB
 REPLACED_SECONDS = 5  # that the pieces of the version before are kept
 UNPUBLISHED_SECONDS = 300  # that a piece is kept whose version has not become the newest: far more than all take
 

@@ -6,6 +6,7 @@ import gymnasium as gym
 import numpy as np
 
 from rmc.common.env.config import EnvConfig
+from rmc.common.env.faults import call_env
 from rmc.common.env.layout import EnvLayout, Part
 from rmc.common.env.spaces import bounds, parts
 from rmc.common.env.wrappers import Env
@@ -13,7 +14,7 @@ from rmc.common.env.wrappers import Env
 
 def structure(env: gym.Env[Any, Any]) -> dict[str, int]:
     """Names and sizes of the observation's parts in order, where the environment tells them (MuJoCo's bodies)."""
-    told = getattr(env.unwrapped, "observation_structure", None)
+    told = call_env("observation_structure", getattr, env.unwrapped, "observation_structure", None)
     named = told if isinstance(told, dict) else {}
     if not all(isinstance(name, str) and isinstance(size, int | np.integer) for name, size in named.items()):
         return {}  # of that name, but something else

@@ -93,4 +93,7 @@ def _import_tasks(env_id: str, packages: tuple[str, str], module: str, how: str)
         raise ConfigError("ENV", env_id, f"{' or '.join(packages)} is missing; {how}")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # shimmy looks for a screen, and says so where there is none
-        importlib.import_module(module)
+        try:
+            importlib.import_module(module)
+        except RAISED as error:  # of dm_control, where MUJOCO_GL names no renderer
+            raise ConfigError("ENV", env_id, f"{module} cannot be imported: {describe_error(error)}") from None

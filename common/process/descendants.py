@@ -12,6 +12,7 @@ import psutil
 PR_SET_CHILD_SUBREAPER = 36
 END_SECONDS = 1.5
 LOOK_SECONDS = 0.01
+_SPARED: set[int] = set()
 
 
 def adopt_orphans() -> None:
@@ -20,10 +21,16 @@ def adopt_orphans() -> None:
         ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
 
 
-def end_children(spared: Collection[int] = ()) -> None:
-    """Kill this process's children and what lies below them, but for the ``spared`` children."""
+def spare_children() -> None:
+    """From now on, the children of now are not ours to end: of a shell that has become this process, or Ray's own."""
+    _SPARED.clear()
+    _SPARED.update(child.pid for child in psutil.Process().children())
+
+
+def end_children(roles: Collection[int] = ()) -> None:
+    """Kill this process's children and what lies below them, but for the ``roles`` and what ``spare_children`` saw."""
     deadline = time.monotonic() + END_SECONDS
-    while strays := [child for child in psutil.Process().children() if child.pid not in spared]:
+    while strays := [child for child in psutil.Process().children() if child.pid not in _SPARED.union(roles)]:
         for child in strays:
             end(child)
             with suppress(ChildProcessError):

@@ -5,6 +5,7 @@ import fcntl
 import logging
 import os
 import time
+from contextlib import suppress
 from pathlib import Path
 
 from rmc.common.errors import ConfigError
@@ -29,6 +30,13 @@ def take_lock(path: Path, patience: float = LOCK_SECONDS) -> int | None:
             warned = True
         time.sleep(LOOK_SECONDS)
     return handle
+
+
+def release_lock(handle: int) -> None:
+    """Let another process have it, also where one that was forked from this one keeps the file open."""
+    with suppress(OSError):
+        fcntl.flock(handle, fcntl.LOCK_UN)
+    os.close(handle)
 
 
 def _locked(handle: int, path: Path) -> bool:

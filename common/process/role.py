@@ -43,10 +43,13 @@ class StopSignal:
         self.requested = self.terminated = False
 
     def install(self) -> None:
-        """Catch both signals in this process, but for those that a program around Python has taken for itself."""
+        """Catch both signals in this process, but for those that a program around Python has taken for itself.
+
+        An ignored Ctrl-C stays ignored: a shell does so for what it starts by &.
+        """
         if signal.getsignal(signal.SIGTERM) is not None:
             signal.signal(signal.SIGTERM, lambda *_: self._terminate())
-        if signal.getsignal(signal.SIGINT) is not None:
+        if signal.getsignal(signal.SIGINT) not in (None, signal.SIG_IGN):
             signal.signal(signal.SIGINT, lambda *_: self.request())
 
     def _terminate(self) -> None:

@@ -68,10 +68,15 @@ def launcher_pid(folder: RunFolder) -> int:
 
 
 def _ask(folder: RunFolder, trainer: int) -> None:
-    """Tell the launcher to end. Raises ConfigError where it is another user's."""
+    """Tell the launcher to end. Raises ConfigError where it is another user's, or the folder names another process."""
     try:
         with suppress(ProcessLookupError):  # it has just ended
-            os.kill(trainer, signal.SIGTERM)
+            os.kill(trainer, 0)
+            if folder.lock.is_held_by(trainer):
+                os.kill(trainer, signal.SIGTERM)
+            elif folder.lock.trainer() == trainer:
+                fix = f"its .lock names process {trainer}, which does not train it; end the right one by hand"
+                raise ConfigError("RUN", str(folder.path), fix)
     except PermissionError:
         fix = f"is trained by {_owner(trainer)} (process {trainer}); only they can stop it, or root"
         raise ConfigError("RUN", str(folder.path), fix) from None

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from urllib.parse import quote
 
-import psutil
 import ray
 
 from rmc.common.errors import CONFIG_STATUS, CheckpointError
@@ -100,7 +99,7 @@ class RoleActor:
     def __init__(self, task: Task) -> None:
         self._task, self._incarnation = task, uuid.uuid4().hex
         descendants.adopt_orphans()  # what an environment starts ends with its role, also where that is killed
-        self._rays_own = {child.pid for child in psutil.Process().children()}
+        descendants.spare_children()  # Ray's own
         self._replaced = self._run_ends = False
         self.trouble = ""
         self.scratch = scratch_folder(task.scratch)
@@ -165,7 +164,7 @@ class RoleActor:
         while not self._role.reap(LOOK_SECONDS):
             with suppress(*AWAY):  # the next look tries again
                 self.tend()
-        descendants.end_children(self._rays_own)
+        descendants.end_children()
         status = self._role.status
         assert status is not None
         if self._replaced:
@@ -211,7 +210,7 @@ class RoleActor:
         if not self._role.reap(self.patience()):
             self._role.signal(9)
             self._role.reap(STOP_SECONDS)
-        descendants.end_children(self._rays_own)
+        descendants.end_children()
 
     def close(self) -> None:
         """End the role, whatever it does, and put away what it left; this actor is killed next."""

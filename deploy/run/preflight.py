@@ -10,6 +10,7 @@ from pathlib import Path
 
 from rich.filesize import decimal as size_text
 
+from rmc.common.bus.weight_store import LARGEST_BYTES
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.host import existing_parent, free_memory, memory_limit
@@ -101,11 +102,16 @@ def check_networks_fit(config: RunConfig) -> None:
     """Raises ConfigError where the networks are larger than the free memory, by the least that they can take.
 
     That is each weight, its gradient and Adam's two moments, of the GRU's square matrices and the heads' second layers.
+    A policy is also held to what is published at once.
     """
     hidden, heads, memory = config.agent.hidden, config.agent.heads, free_memory()
-    for name, value, weights in (("--hidden", hidden, 3 * hidden**2), ("--heads", heads, 4 * math.prod(heads))):
+    sizes = (("--hidden", hidden, 3 * hidden**2, 1), ("--heads", heads, 4 * math.prod(heads), 4))
+    for name, value, weights, networks in sizes:
         if (needed := 4 * 4 * weights) > memory:
             fault = f"its weights take {size_text(needed)} of {size_text(memory)} free memory in training"
+            raise ConfigError(name, value, f"{fault}; take fewer units")
+        if (policy := 4 * weights // networks) > LARGEST_BYTES:
+            fault = f"its weights take {size_text(policy)} of {size_text(LARGEST_BYTES)} that a policy may have"
             raise ConfigError(name, value, f"{fault}; take fewer units")
 
 

@@ -5,14 +5,18 @@
 
 import fcntl
 import os
+import re
 import socket
 from contextlib import suppress
 from pathlib import Path
 
+import psutil
+
 from rmc.common.errors import ConfigError
-from rmc.common.process.file_lock import WITHOUT_LOCKS, take_lock, try_lock
+from rmc.common.process.file_lock import WITHOUT_LOCKS, release_lock, take_lock, try_lock
 
 BOOT = Path("/proc/sys/kernel/random/boot_id")  # no two machines have one
+PROCESS = re.compile("[1-9][0-9]{0,8}")  # a signal to 0 or -1 would reach many
 LOCK_SECONDS = 1.0  # others look, now and then, whether the folder is locked
 
 
@@ -49,7 +53,7 @@ class RunLock:
         if self._handle is not None:
             with suppress(OSError):  # no room
                 self._note(text)
-            os.close(self._handle)
+            release_lock(self._handle)
             self._handle = None
 
     def _note(self, text: str) -> None:
@@ -87,13 +91,20 @@ class RunLock:
             with self._file.open("rb") as file:
                 word, *rest = file.read().decode().split()
                 free = try_lock(file.fileno(), fcntl.LOCK_SH)
-                return None if free or word != "training" else int(rest[0])
+                return None if free or word != "training" or not PROCESS.fullmatch(rest[0]) else int(rest[0])
         except (FileNotFoundError, ValueError, IndexError):
             return None
         except OSError as error:
             if error.errno not in WITHOUT_LOCKS:
                 raise
             return None  # a copy: no launcher trains where it cannot lock
+
+    def is_held_by(self, process: int) -> bool:
+        """Whether that process has the lock's file open; False where others hide theirs."""
+        with suppress(psutil.Error):
+            opened = [file.path for file in psutil.Process(process).open_files()]
+            return any(Path(path).name == self._file.name and self._file.samefile(path) for path in opened)
+        return False
 
     def trained_elsewhere(self) -> str:
         """The machine or container whose launcher trains this run; empty where that is here, or none does."""

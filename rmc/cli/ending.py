@@ -23,7 +23,8 @@ def print_end(folder: RunFolder, console: Console) -> int:
         raise RoleDied(f"the launcher of {folder.path} was killed; to go on: {resume_command(folder)}")
     log_file = folder.logs / "launcher.log"
     last_lines = log_file.read_text(errors="replace").strip().splitlines()[-30:] if log_file.exists() else []
-    console.print("\n".join(last_lines), soft_wrap=True)
+    for line in last_lines:  # of a stranger's run, perhaps
+        console.print(line if line.isprintable() else ascii(line), soft_wrap=True)
     raise RoleDied(f"the launcher of {folder.path} ended with status {status}; the whole of its words: {log_file}")
 
 

@@ -31,6 +31,7 @@ def main() -> None:
     which a user waits for after Ctrl-C.
     """
     output.take_over()
+    descendants.spare_children()
     watchdog.start()
     try:
         status = run(sys.argv[1:])

@@ -1,13 +1,12 @@
 """``sweep.jsonl``: what ran in a sweep's folder, a line a run; and the folder's lock."""
 
 import json
-import os
 import shlex
 from pathlib import Path
 
 from rmc.analysis.history import objects, of_run
 from rmc.common.errors import ConfigError
-from rmc.common.process.file_lock import take_lock
+from rmc.common.process.file_lock import release_lock, take_lock
 from rmc.common.whole_file import write_whole
 from rmc.deploy.run.folder import RunFolder
 from rmc.sweep.job import Job
@@ -41,7 +40,7 @@ class Index:
     def close(self) -> None:
         """Let another sweep in."""
         if self._lock is not None:
-            os.close(self._lock)
+            release_lock(self._lock)
 
     def state(self, job: Job) -> str:
         """What became of it so far."""

@@ -455,6 +455,15 @@ def test_what_an_environment_started_ends_with_a_command_that_fails_of_a_bug() -
     assert not psutil.pid_exists(int(ended.stdout))
 
 
+def test_what_a_shell_started_before_it_became_a_command_lives_on() -> None:
+    """Bash runs the last command of ``-c`` in its own place."""
+    words = f"sleep 60 >&- 2>&- & echo $!; exec {sys.executable} -m rmc.cli.main --version"
+    ended = subprocess.run(["bash", "-c", words], capture_output=True, text=True, check=True)
+    child = psutil.Process(int(ended.stdout.split()[0]))
+    assert child.name() == "sleep"
+    child.kill()
+
+
 def test_options_become_the_config() -> None:
     words = ["train", PENDULUM, "--preset", "paper", "--seed", "4", "--envs-per-actor", "3", "--heads", "64", "32"]
     command = parser.parse([*words, "--replay-ratio", "64", "--flicker", "0.5", "--head-input", "hidden+observation"])

@@ -16,7 +16,7 @@ from rich.console import Console
 from rmc.analysis import evaluation
 from rmc.cli import main, training
 from rmc.cli.ending import print_end
-from rmc.cli.signals import signals_interrupt
+from rmc.cli.signals import signals_caught, signals_interrupt
 from rmc.cli.training import conduct
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import STOPPED_STATUS, RoleDied
@@ -200,6 +200,9 @@ def test_an_ignored_signal_stays_ignored():
     try:
         with signals_interrupt():
             signal.raise_signal(signal.SIGINT)
+            with signals_caught() as stop:
+                signal.raise_signal(signal.SIGINT)
+                assert not stop.requested
     finally:
         signal.signal(signal.SIGINT, before)
 
@@ -254,6 +257,16 @@ def test_what_nobody_expected_stays_there_too(folder, monkeypatch):
     text = (folder.logs / "launcher.log").read_text()
     assert text.startswith("Traceback")
     assert text.endswith("ZeroDivisionError: integer division or modulo by zero\n")
+
+
+def test_another_users_words_do_not_reach_the_terminal_as_control_codes(folder):
+    folder.lock.take()
+    folder.lock.release(1)
+    (folder.logs / "launcher.log").write_text("plain [1/2]\n\x1b]0;title taken\x07\x1b[2J\n")
+    output = io.StringIO()
+    with pytest.raises(RoleDied, match="ended with status 1"):
+        print_end(folder, Console(file=output, width=200, markup=False, highlight=False))
+    assert output.getvalue() == "plain [1/2]\n'\\x1b]0;title taken\\x07\\x1b[2J'\n"
 
 
 def test_a_run_whose_launcher_was_killed_says_how_to_go_on(folder):

@@ -66,7 +66,16 @@ def test_one_that_redis_cannot_read_is_named_without_its_parts(url: str) -> None
         *((path, "database") for path in ("/abc", "/1/2", "/-1")),
         *(
             (f"?{option}", "options")
-            for option in ("db=abc", "nope=1", "socket_timeout=-1", "socket_connect_timeout=nan")
+            for option in (
+                "db=abc",
+                "nope=1",
+                "socket_timeout=-1",
+                "socket_connect_timeout=nan",
+                "decode_responses=True",
+                "encoding_errors=strict",
+                "cache_config=x&protocol=3",
+                "socket_keepalive_options=1",
+            )
         ),
     ],
 )
@@ -95,6 +104,26 @@ def test_a_login_that_the_other_end_repeats_is_not_shown() -> None:
         with pytest.raises(BusUnavailable, match=r"unknown command.*…") as raised:
             RedisBus(f"redis://:hunter2@127.0.0.1:{port}", "run").ping()
     assert "hunter2" not in str(raised.value)
+
+
+def test_what_is_no_redis_is_an_outage() -> None:
+    """Of a web server, say; what it answers is not repeated."""
+
+    def answer(listener: socket.socket) -> None:
+        for _ in range(2):
+            accepted, _ = listener.accept()
+            with accepted:
+                accepted.recv(4096)
+                accepted.sendall(b"<html>hunter2")
+
+    with socket.create_server(("127.0.0.1", 0)) as listener, ThreadPoolExecutor(1) as pool:
+        pool.submit(answer, listener)
+        bus = RedisBus(f"redis://127.0.0.1:{listener.getsockname()[1]}", "run")
+        for _ in range(2):
+            with pytest.raises(BusUnavailable, match="what answers is no Redis"):
+                bus.ping()
+    with pytest.raises(BusUnavailable, match="its host has an impossible name"):
+        RedisBus("redis://redis..example.com:6379", "run").ping()
 
 
 def test_a_login_without_its_scheme_is_not_repeated() -> None:

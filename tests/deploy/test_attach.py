@@ -4,6 +4,7 @@ import io
 import itertools
 import json
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -65,6 +66,35 @@ def test_a_trainer_that_was_killed_has_not_ended(folder: RunFolder) -> None:
     folder.lock.take()
     assert folder.lock.trainer() == os.getpid()
     folder.lock.release()
+
+
+@pytest.mark.parametrize("number", ["-1", "0", "one", ""])
+def test_no_process_but_the_trainer_is_told_to_end(folder: RunFolder, number: str) -> None:
+    """In a stranger's folder anything may be written."""
+    with holder(folder, 0) as owner, subprocess.Popen(["sleep", "60"]) as other:
+        lock, text = folder.path / ".lock", (folder.path / ".lock").read_text()
+        lock.write_text(text.replace(str(owner.pid), str(other.pid)))
+        with pytest.raises(ConfigError, match=f"its .lock names process {other.pid}, which does not train it"):
+            stop(folder)
+        lock.write_text(text.replace(str(owner.pid), number))
+        assert folder.lock.trainer() is None
+        assert other.poll() is None
+        other.kill()
+        owner.communicate("\n")
+
+
+def test_a_lock_is_let_go_though_a_forked_process_lives_on(folder: RunFolder) -> None:
+    folder.lock.take()
+    child = os.fork()
+    if child == 0:
+        signal.pause()
+    folder.lock.release(0)
+    try:
+        folder.lock.take()
+        folder.lock.release()
+    finally:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
 
 
 def test_a_trainer_on_another_machine_is_not_ours_to_stop(folder: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:

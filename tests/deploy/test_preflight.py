@@ -70,6 +70,18 @@ def test_networks_that_no_memory_holds_are_refused(agent: dict[str, Any], named:
         check_learner(config, "cpu")
 
 
+@pytest.mark.parametrize(
+    ("agent", "named"), [({"hidden": 9_500}, "--hidden"), ({"heads": (16_400, 16_400)}, "--heads")]
+)
+def test_a_policy_that_is_too_large_to_be_published_is_refused(
+    agent: dict[str, Any], named: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(preflight, "free_memory", lambda: 1 << 40)
+    config = run(15, 8)
+    with pytest.raises(ConfigError, match=f"^{named}=.* of 1.1 GB that a policy may have; take fewer units$"):
+        check_learner(dataclasses.replace(config, agent=dataclasses.replace(config.agent, **agent)), "cpu")
+
+
 def test_a_run_that_goes_on_is_offered_no_capacity_that_it_would_refuse(memory: int, tmp_path: Path) -> None:
     config = robust(EnvConfig("HalfCheetah-v5"))
     (tmp_path / "config.json").write_text("{}")

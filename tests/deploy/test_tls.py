@@ -5,6 +5,8 @@ import stat
 import subprocess
 import tempfile
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -102,6 +104,33 @@ def test_redis_takes_encrypted_clients_that_know_the_password(folder: Path) -> N
         for wrong in (url.replace("rediss", "redis").partition("?")[0], url.replace(USERS.password(LAUNCHER), "guess")):
             with pytest.raises(BusUnavailable):
                 RedisBus(wrong, USERS.run).ping()
+
+
+def test_the_machines_own_authorities_are_not_trusted_where_a_certificate_is_named(
+    folder: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whose server would be sent the password."""
+    stranger = tmp_path_factory.mktemp("stranger")
+    tls.make_certificate(stranger)
+    monkeypatch.setenv("SSL_CERT_FILE", str(stranger / tls.CERTIFICATE))
+    heard: list[bytes] = []
+
+    def serve(listener: socket.socket) -> None:
+        context = tls.server_context(stranger)
+        while not heard:  # a client tries again
+            accepted, _ = listener.accept()
+            with accepted, suppress(OSError), context.wrap_socket(accepted, server_side=True) as encrypted:
+                heard.append(encrypted.recv(4096))
+
+    with socket.create_server(("127.0.0.1", 0)) as listener, ThreadPoolExecutor(1) as pool:
+        pool.submit(serve, listener)
+        url = f"rediss://:hunter2@127.0.0.1:{listener.getsockname()[1]}?ssl_check_hostname=no"
+        with pytest.raises(BusUnavailable, match="certificate verify failed"):
+            RedisBus(f"{url}&ssl_ca_certs={folder / tls.CERTIFICATE}", "run").ping()
+        assert heard == []
+        with pytest.raises(BusUnavailable):  # the machine trusts it
+            RedisBus(url, "run").ping()
+    assert b"hunter2" in heard[0]
 
 
 @pytest.fixture
