@@ -32,7 +32,7 @@ class ActorConfig:
     refresh_steps: int = 400
     """Agent steps of an actor between two checks for new weights."""
     chunk_windows: int = 16
-    """Windows sent in one entry at most; it also ends at 1 MiB."""
+    """Windows after which an actor sends an entry; it also ends at 1 MiB."""
     chunk_seconds: float = 0.5
     """Seconds after which an incomplete entry is sent."""
     unacked_bytes: int = 64 << 20

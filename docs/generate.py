@@ -115,7 +115,7 @@ WHEN = {
     "scheme": "to repeat the paper's table 1, where 1 is best; in our "
     "[results](results.md) 3 is ahead of 1 with half of the frames missing, else level",
     "policy_through_q": "with schemes 4 to 6",
-    "update_order": "`alternate` for algorithm 1 as printed, at five times the forwards "
+    "update_order": "`alternate` for algorithm 1 as printed, at up to five times the forwards "
     "(four with `--no-impute-missing`)",
     "model_norm": "to repeat the paper's comparison",
     "policy_delay": "1 for more return from each step, up for more updates a second: [results](results.md)",

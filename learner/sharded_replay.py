@@ -2,7 +2,8 @@
 
 Shapes: B windows in a batch, S shards. A window's chance is its weight over the total of all shards, as if one server
 held them all: a shard's part of a batch is how many of B equal strata of the whole weight fall to it, and within it
-the shard draws by its own weights. A total is that of a shard's newest draw. Serials become ``serial * S + shard``,
+the shard draws by its own weights. A total is that of a shard's newest draw. A new window enters with the largest
+priority of its own shard. Serials become ``serial * S + shard``,
 so that priorities find their way back.
 """
 

@@ -4,8 +4,7 @@ import torch
 from torch import Tensor
 
 from rmc.common.agent import Agent
-from rmc.common.window import WindowSpec
-from rmc.learner.batch import Batch, Plan
+from rmc.learner.batch import Batch
 from rmc.learner.config import UpdateConfig
 from rmc.learner.optimizers import make_adam
 from rmc.learner.update import JointUpdate, UpdateResult, detached
@@ -15,7 +14,7 @@ class AlternateUpdate(JointUpdate):
     """Algorithm 1 as printed: model, what fills, critics, policy, temperature in turn, each from a fresh forward.
 
     Each has an optimiser of its own, so that a memory that several losses train is moved by several. Each forward moves
-    the running statistics of critics with batch norm.
+    the running statistics of critics with batch norm. What has no turn in an update has no forward there.
     """
 
     _STAGES = (
@@ -32,16 +31,13 @@ class AlternateUpdate(JointUpdate):
     def _stages(self) -> list[tuple[str, tuple[str, ...]]]:
         return [(part, names) for part, names in self._STAGES if getattr(self.agent, part) is not None]
 
-    def plan(self, raw: Tensor, spec: WindowSpec, number: int) -> Plan:
-        """Of update ``number``: what imputes has a stage of its own, in each."""
-        return super().plan(raw, spec, number)._replace(trains_imputer=self.agent.next_frame is not None)
-
     def __call__(self, batch: Batch, beta: Tensor) -> UpdateResult:
         """One round from a Batch. Each loss is from its own stage's forward, all else from the critics'."""
         metrics: dict[str, Tensor] = {}
         norms = []
+        turns = {"policy": batch.plan.trains_policy, "next_frame": batch.plan.trains_imputer}
         for optimizer, (part, names) in zip(self.optimizers, self._stages(), strict=True):
-            if part == "policy" and not batch.plan.trains_policy:
+            if not turns.get(part, True):
                 continue
             loss_values, model, actor_critic = self.forward(batch, beta)
             assert loss_values.keys() <= {name for _, stage in self._STAGES for name in stage}, "a loss without a stage"

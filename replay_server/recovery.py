@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from rmc.common.errors import ConfigError
 from rmc.common.process.file_lock import take_lock
-from rmc.common.window import WindowSpec
+from rmc.common.window import Slots, WindowSpec
 from rmc.replay_server.ring import Ring, reserve
 from rmc.replay_server.sum_tree import SumTree, Values
 
@@ -40,11 +40,15 @@ class ReplayStore:
         self.priorities[slots] = priorities
         self.tree.set(slots, self.leaf_values(priorities))
 
-    def largest_priority(self) -> float:
-        """Of the windows that are there, with which a new one enters; the last known where that cannot be told."""
+    def largest_priority(self, overwritten: Slots) -> float:
+        """Of the windows that are there, with which a new one enters; the last known where that cannot be told.
+
+        Those of (B,) slots are there no more, but in the tree still.
+        """
         if not self.exponent:  # of no effect
             return self.ring.progress.max_priority
         there = self.tree.leaves() > 0.0
+        there[overwritten] = False
         if not there.any():
             return self.ring.progress.max_priority
         return float(self.priorities[there[: len(self.priorities)]].max())

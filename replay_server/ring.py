@@ -72,11 +72,7 @@ class Ring:
             self.progress.valid_from = valid_from
             self._records.write(self.progress)
         slots: Slots = serials[-self.capacity :] % self.capacity
-        blocks = rows[-self.capacity :].view(self._blocks.dtype)
-        start = int(slots[0]) if len(slots) else 0
-        fits = min(len(blocks), self.capacity - start)
-        self._blocks[start : start + fits] = blocks[:fits]
-        self._blocks[: len(blocks) - fits] = blocks[fits:]
+        self._blocks[slots] = rows[-self.capacity :].view(self._blocks.dtype)
         return slots
 
     def commit(self, rows: int = 0) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rmc.common.bus.protocol import Bus, ReplayOwner, Version
+from rmc.common.errors import RmcError
 from rmc.common.metrics import Means, Rate
 from rmc.common.replay import EPISODE_BYTES, ObservationStatistics, Sample, SampleStatus
 from rmc.common.shard import WHOLE, Shard
@@ -104,7 +105,7 @@ class ReplayServer:
         ring, progress, rows = self._store.ring, self._store.ring.progress, batch.rows
         sums = observation_sums(rows, self.spec, self.statistics())
         slots = ring.write(rows)
-        progress.max_priority = self._store.largest_priority()
+        progress.max_priority = self._store.largest_priority(slots)
         initial = rows["initial_priority"][-ring.capacity :]
         priorities = np.where(initial > 0, np.maximum(initial, PRIORITY_FLOOR), progress.max_priority)
         self._store.set_priorities(slots, priorities.astype(np.float32))
@@ -136,7 +137,7 @@ class ReplayServer:
         """Draw (B,) rows in proportion to priority ** exponent, if the limiter lets it.
 
         The rows lie in ``out``, else in one of two buffers that draws take in turn. A draw depends on the seed, its
-        number and the ring alone.
+        number and the ring alone. Raises RmcError where every window is damaged.
         """
         progress, tree = self._store.ring.progress, self._store.tree
         progress.elsewhere_steps = max(progress.elsewhere_steps, drawn_elsewhere_steps)
@@ -148,8 +149,8 @@ class ReplayServer:
             return Sample(status, None, None, tree.total, progress.env_steps, progress.drawn_steps)
         rows = self._buffer(batch_size) if out is None else out
         slots = self._draw_into(rows)
-        if slots is None:
-            return self.sample(batch_size, drawn_elsewhere_steps, out)  # which waits
+        if slots is None:  # actors without credit would wait for the learner, and it for them
+            raise RmcError(f"{self.name}: every window of the ring is damaged; the next start begins with an empty one")
         progress.draws += 1
         progress.drawn_steps += self.spec.trained_steps(rows)
         self._store.ring.commit()

@@ -253,6 +253,17 @@ def test_what_is_evaluated_and_saved_is_the_average_where_asked_and_actors_have_
         assert torch.equal(value, judged[name]), name
 
 
+def test_the_average_is_the_newest_until_it_moves_for_the_first_time(setting):
+    setting.learner.close()
+    learner = setting.learner = setting.start(2_000)
+    setting.feed(60)
+    while learner.updates < MOVE_UPDATES - 1:
+        learner.step()
+    newest = learner.agent.policy_weights()
+    for name, value in learner.update.average.policy_weights().items():
+        assert torch.equal(value, newest[name]), name
+
+
 def test_no_valid_checkpoint_is_an_error(setting):
     setting.update()
     setting.learner.close()

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from rmc.common.bus.memory_bus import MemoryBus
+from rmc.common.errors import RmcError
 from rmc.common.replay import SampleStatus
 from rmc.common.window import Rows
 from rmc.replay_server import row_check
@@ -50,14 +51,20 @@ def test_a_damaged_row_is_never_drawn(
     assert again._store.tree.values(np.array([3])).tolist() == [0.0]
 
 
-def test_a_ring_of_damaged_rows_alone_makes_the_learner_wait(make: Make, bus: MemoryBus) -> None:
+def test_a_ring_of_damaged_rows_alone_ends_its_server_and_the_next_begins_empty(make: Make, bus: MemoryBus) -> None:
+    """Actors without credit would wait for the learner, and it for them."""
     server, _ = filled(make(), bus, 20)
     server._store.ring.rows["last"] = 10**9
-    assert server.sample(8).status is SampleStatus.WAIT
+    with pytest.raises(RmcError, match="every window of the ring is damaged"):
+        server.sample(8)
     assert (server.stats()["drawn_steps"], server.stats()["draws"]) == (0, 0)
     assert server.stats()["damaged_windows"] == 20
     server.update_priorities(np.arange(20), np.ones(20, np.float32))
     assert server.sample(8).status is SampleStatus.WAIT
+    close(server)
+    again = make()
+    assert again._store.ring.progress.inserted == 0
+    assert again.sample(8).status is SampleStatus.WAIT
 
 
 def test_an_episode_with_a_damaged_row_is_none(make: Make, bus: MemoryBus) -> None:

@@ -86,6 +86,17 @@ def test_slots_that_hold_no_window_raise_no_new_windows_priority(make: Make, bus
     assert server._store.priorities[:3].tolist() == [0.5, 0.25, 0.5]
 
 
+def test_an_overwritten_window_raises_no_new_windows_priority(make: Make, bus: MemoryBus) -> None:
+    server, sender = make(dataclasses.replace(OPEN, capacity=4)), Sender(bus)
+    sender.send(4)
+    drain(server)
+    server.update_priorities(np.arange(4), np.array([100.0, 1.0, 2.0, 0.5], np.float32))
+    sender.send(1)
+    drain(server)
+    assert server._store.priorities.tolist() == [2.0, 1.0, 2.0, 0.5]
+    assert server.stats()["max_priority"] == 2.0
+
+
 def test_a_priority_that_was_corrected_is_no_new_windows(make: Make, bus: MemoryBus) -> None:
     """As a learner gives that diverges, and begins again at its last checkpoint."""
     server, sender = filled(make(), bus, 4)
