@@ -52,7 +52,7 @@ class BaselineModel:
 
     @property
     def steps(self) -> int:
-        """Environment steps so far."""
+        """Agent steps so far."""
         return int(self.sb3.num_timesteps)
 
     @property

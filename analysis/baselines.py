@@ -100,7 +100,7 @@ def _open_folder(config: BaselineConfig, run_dir: Path | None, sizes: dict[str, 
     if refused := next((path for path in changed if path not in MAY_CHANGE), None):
         was, now = changed[refused]
         fix = f"the run in {folder.path} has {was!r}; use that, or another --run-dir"
-        name = {"env.id": "ENV", "algorithm": "ALGORITHM"}.get(refused) or option(refused)
+        name = option(refused)
         raise ConfigError(name, now, fix)
     if there:
         folder.check_sizes(config.env.id, sizes)
@@ -146,7 +146,7 @@ class _Run(BaseCallback):
 
     @property
     def steps(self) -> int:
-        """Environment steps so far."""
+        """Agent steps so far."""
         return self._model.steps
 
     # -- training ---------------------------------------------------------------------------------------
@@ -208,7 +208,7 @@ class _Run(BaseCallback):
         self._write_progress()
         self._write("evaluator", {**result, "eval_update": self._model.updates, "eval_env_steps": self.steps})
         mean, deviation = result["eval_return_mean"], result["eval_return_std"]
-        line = f"environment step {self.steps:,}: return {mean:,.1f} ± {deviation:,.1f}, {self._wall():,.0f} s"
+        line = f"step {self.steps:,}: return {mean:,.1f} ± {deviation:,.1f}, {self._wall():,.0f} s"
         self._console.print(line)
 
     def _speak(self) -> None:
@@ -252,7 +252,7 @@ def _initial_return(folder: RunFolder) -> float | None:
 
 
 def _evaluated_steps(folder: RunFolder) -> int:
-    """Environment steps at the last evaluation; 0 before the first."""
+    """Agent steps at the last evaluation; 0 before the first."""
     said = (record.get("eval_env_steps") for record in MetricsTail(folder.metrics).take())
     return max((steps for steps in said if isinstance(steps, int)), default=0)
 

@@ -142,7 +142,7 @@ def _facts(layout: EnvLayout, played: Played) -> Iterator[str]:
     if any(played.missing):
         yield f"{np.mean(played.missing):.0%} of what is observed is missing"
     if played.lengths:
-        ended = f"{played.terminated} of them terminated, the others cut off"
+        ended = f"{played.terminated} of them terminated"
         shortest, longest = min(played.lengths), max(played.lengths)
         steps = f"{shortest} to {longest}" if shortest < longest else f"{longest}"
         yield f"{len(played.lengths)} episode{'s' * (len(played.lengths) != 1)} of {steps} steps, {ended}"

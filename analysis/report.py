@@ -111,22 +111,26 @@ def _course(run: ReportRun) -> dict[str, Any]:
 def differences(runs: Sequence[ReportRun]) -> dict[str, Any]:
     """Options that are not alike in the runs that have them; of one run, those that are not its preset's."""
     if len(runs) == 1 and runs[0].folder.is_baseline():
-        options = [[option(path), words(value)] for path, value in runs[0].options.items()]
+        options = [[name, words(value)] for name, value in _by_name(runs[0]).items()]
         return {"columns": [runs[0].name], "rows": options, "note": "Options. A baseline has no preset."}
     if len(runs) == 1:
         changed = runs[0].changed()
         rows = [[option(path), *map(words, values)] for path, values in changed.items()]
         note = "Options that are not the preset's." if rows else "All options are the preset's."
         return {"columns": ["preset", runs[0].name], "rows": rows, "note": note}
-    paths = list(dict.fromkeys(path for run in runs for path in run.options))
-    values = {path: [run.options[path] for run in runs if path in run.options] for path in paths}
-    differing = [path for path, settings in values.items() if any(one != settings[0] for one in settings)]
-    rows = [
-        [option(path), *(words(run.options[path]) if path in run.options else "-" for run in runs)]
-        for path in differing
-    ]
+    columns = [_by_name(run) for run in runs]
+    rows = []
+    for name in dict.fromkeys(name for column in columns for name in column):
+        values = [column[name] for column in columns if name in column]
+        if any(value != values[0] for value in values):
+            rows.append([name, *(words(column[name]) if name in column else "-" for column in columns)])
     note = "Options that are not alike in all runs that have them." if rows else "All options are alike."
     return {"columns": [run.name for run in runs], "rows": rows, "note": note}
+
+
+def _by_name(run: ReportRun) -> dict[str, Any]:
+    """Its options; a baseline's lie at other paths of its config than a run's."""
+    return {option(path): value for path, value in run.options.items()}
 
 
 def words(value: Any) -> str:

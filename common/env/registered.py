@@ -46,7 +46,7 @@ def entry_point(spec: EnvSpec) -> Callable[..., Any]:
 def _unknown(module: str, name: str) -> str:
     """That no such environment is registered, and which one may be meant."""
     newest = [one.id for one in gym.registry.values() if one.version == find_highest_version(one.namespace, one.name)]
-    close = difflib.get_close_matches(name, newest, n=3, cutoff=0.5)
+    close = difflib.get_close_matches(name, newest, n=3, cutoff=0.7)
     fix = f"did you mean {', '.join(close)}?" if close else "use a gymnasium id or module:EnvId-v0"
     if close and not module:
         fix = f"{fix} One of your own is module:{name}"

@@ -48,7 +48,9 @@ def joined(address: str, cpus: int | None = None) -> Iterator[None]:
             check_head(address)
             ray.init(address=address, **quiet)
     except (OSError, ValueError, RuntimeError, ray.exceptions.RayError) as error:
-        fix = f"no Ray cluster answers ({first_line(error)}); start one with ray start --head, or take local"
+        fix = (
+            f"no Ray cluster answers ({first_line(error)}); start one with ray start --head; rmc train takes local, too"
+        )
         raise ConfigError("--ray-address", address, fix) from None
     except SystemExit:  # Ray's own handler of SIGTERM
         raise KeyboardInterrupt from None

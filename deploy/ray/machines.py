@@ -63,8 +63,10 @@ def read_cluster_file(path: Path) -> dict[str, Any]:
     """A cluster's file. Raises ConfigError where it is none."""
     try:
         config = yaml.safe_load(path.read_text())
-    except (OSError, UnicodeError, yaml.YAMLError) as error:
-        raise ConfigError("CONFIG", str(path), f"cannot be read ({one_line(error)})") from None
+    except OSError as error:
+        raise ConfigError("CONFIG", str(path), f"cannot be read ({error.strerror}); give a cluster's file") from None
+    except (UnicodeError, yaml.YAMLError) as error:
+        raise ConfigError("CONFIG", str(path), f"is not YAML ({one_line(error)}); fix it") from None
     provider = config.get("provider") if isinstance(config, dict) else None
     if not isinstance(provider, dict) or "type" not in provider:
         raise ConfigError("CONFIG", str(path), "is no Ray cluster's file; start from one in deploy/cluster/")

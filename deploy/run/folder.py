@@ -111,7 +111,7 @@ class RunFolder:
     def config(self) -> RunConfig:
         """The run's config. Raises ConfigError, which names the folder, where it cannot be read or is a baseline's."""
         if self.is_baseline():
-            fix = "is a baseline's run; rmc resume continues it, and rmc evaluate, plot, report and stop take it"
+            fix = "is a baseline's run; only rmc evaluate, plot, report, stats, watch, resume and stop take it"
             raise ConfigError("RUN", str(self.path), fix)
         try:
             return from_json((self.path / "config.json").read_bytes())

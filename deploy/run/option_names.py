@@ -11,6 +11,8 @@ from typing import Any
 from rmc.common.env.config import write_kwargs
 from rmc.common.errors import ConfigError
 
+POSITIONAL = {"env.id": "ENV", "algorithm": "ALGORITHM"}
+
 
 def flat(config: Any, prefix: str = "") -> dict[str, Any]:
     """The values of a config, or of what JSON holds of one, by dotted path."""
@@ -28,14 +30,16 @@ def changes(was: Any, now: Any) -> dict[str, list[Any]]:
 
 
 def option(path: str) -> str:
-    """The command line's name of a config path: ``replay.replay_ratio`` is ``--replay-ratio``."""
-    return "--" + path.rpartition(".")[2].replace("_", "-")
+    """The command line's name of a config path, which is ``--replay-ratio`` for ``replay.replay_ratio``."""
+    return POSITIONAL.get(path) or "--" + path.rpartition(".")[2].replace("_", "-")
 
 
 def did_you_mean(word: str, known: Iterable[str], otherwise: str = "") -> str:
     """The end of a message on a word that is not known: what is most like it, or ``otherwise``."""
-    near = difflib.get_close_matches(word, known, 1)
-    return f"; did you mean {near[0]}?" if near else otherwise
+    plain, names = word.lstrip("-"), {name.lstrip("-"): name for name in known}
+    longer = (name for name in names if len(plain) > 1 and name.startswith(plain))
+    near = difflib.get_close_matches(plain, names, 1, cutoff=0.7) or list(longer)
+    return f"; did you mean {names[near[0]]}?" if near else otherwise
 
 
 def read_toml(option: str, path: Path, fix: str) -> dict[str, Any]:

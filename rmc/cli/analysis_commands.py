@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rmc.analysis import curves, env_check, history
+from rmc.analysis.out_file import PICTURES, check_writable
 from rmc.analysis.report import check_report, write_report
 from rmc.analysis.report_run import ReportRun, told_apart
 from rmc.analysis.run_paths import each_readable
@@ -19,6 +20,7 @@ def check_env(command: run_options.CheckEnv) -> int:
 
 
 def plot(command: run_options.Plot) -> int:
+    check_writable("--out", command.out, PICTURES)
     groups, console = curves.grouped(_histories(command.runs)), terminal(max(terminal().width, curves.WIDTH))
     console.print(*curves.tables(groups, command.reference), sep="\n")
     curves.draw(groups, command.by, command.out)

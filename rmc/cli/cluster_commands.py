@@ -9,6 +9,7 @@ from dataclasses import asdict
 
 from rich.table import Table
 
+from rmc.common.errors import ConfigError
 from rmc.deploy.monitor.figures import duration, number
 from rmc.deploy.monitor.table import plain_table
 from rmc.deploy.monitor.view import terminal
@@ -36,7 +37,14 @@ def stop(run: str, address: str) -> int:
 
 @contextmanager
 def _joined(address: str) -> Iterator[None]:
-    """Ray tells every driver on standard output what goes wrong in its cluster: none of it is ours, or JSON."""
+    """Ray tells every driver on standard output what goes wrong in its cluster: none of it is ours, or JSON.
+
+    Raises ConfigError where no cluster answers.
+    """
+    if address == "local":
+        raise ConfigError(
+            "--ray-address", address, "starts a cluster of its own, where no run is; give auto or HOST:PORT"
+        )
     with redirect_stdout(sys.stderr), launcher.joined(address):
         yield
 

@@ -7,16 +7,18 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
-from rmc.cli.run_options import Checkpoint
+from rmc.cli.run_options import Checkpoint, Run
+
+Repo = Annotated[Positional[str], tyro.conf.arg(metavar="REPO")]
 
 
 @dataclass(frozen=True)
 class Push:
     """Put a policy and its model card into a repository of the Hugging Face hub."""
 
-    run: Positional[Path]
+    run: Run
     """The run's folder, or a policy file."""
-    repo: Positional[str]
+    repo: Repo
     """owner/name; made where it is not there."""
     checkpoint: Checkpoint = "latest"
     license: str | None = None
@@ -29,7 +31,7 @@ class Push:
 class Pull:
     """Get a policy from a repository of the Hugging Face hub."""
 
-    repo: Positional[str]
+    repo: Repo
     """owner/name."""
     out: Path = Path("policy.safetensors")
     """The file to write."""

@@ -117,8 +117,8 @@ def inspect(command: run_options.Inspect) -> int:
     console.print(f"unexplained of the observation's change: {ahead} (100% is a guess of no change)", soft_wrap=True)
     console.print(f"worst dimensions one step ahead: {worst}")
     if value is None:
-        which = "compared where --n-step is 1 and episodes end by themselves, or outlast 3 / (1 - gamma) steps"
-        console.print(f"what the critics expect and what came: {which}", soft_wrap=True)
+        needed = "--n-step 1, and episodes that terminate or outlast 3 / (1 - gamma) steps"
+        console.print(f"critics are not compared with returns: that takes {needed}", soft_wrap=True)
     else:
         counted = f"with the entropy's bonus, without curiosity, over {value.steps:,} steps"
         console.print(

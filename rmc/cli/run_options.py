@@ -12,6 +12,8 @@ from rmc.analysis.curves import Axis
 from rmc.cli.train_options import EnvOptions, KnownEnvOptions, KnownRunDir, field_values, known_run
 from rmc.deploy.run.folder import RunFolder
 
+Run = Annotated[Positional[Path], arg(metavar="RUN")]
+Runs = Annotated[Positional[tuple[Path, ...]], arg(metavar="RUNS")]
 Checkpoint = Annotated[
     str, arg(help="latest, best of those evaluated while it trained, or the number of a checkpoint.")
 ]
@@ -21,7 +23,7 @@ Checkpoint = Annotated[
 class Evaluate:
     """Play deterministic episodes with a run's checkpoint, or with a policy file."""
 
-    run: Positional[Path]
+    run: Run
     """The run's folder, a policy file, or hf://owner/name."""
     episodes: int = 10
     """Episodes to play."""
@@ -35,14 +37,14 @@ class Evaluate:
     env_timeout: float | None = None
     """Timeout of a call into the environment, in seconds; by default the run's own."""
     json: bool = False
-    """Print one line of JSON."""
+    """Print a line of JSON for each probability."""
 
 
 @dataclass(frozen=True)
 class Export:
     """Write a policy as one file: policy.safetensors for load_policy, or ONNX for programs without torch."""
 
-    run: Positional[Path]
+    run: Run
     """The run's folder, a policy file, or hf://owner/name."""
     out: Path = Path("policy.onnx")
     """The file to write, which ends in .safetensors or .onnx."""
@@ -53,7 +55,7 @@ class Export:
 class Inspect:
     """Show what a run's world model knows and what its memory holds, as a picture and in numbers."""
 
-    run: Positional[Path]
+    run: Run
     """The run's folder."""
     out: Path = Path("inspect.png")
     """The picture to write."""
@@ -109,7 +111,7 @@ def resuming_baseline(folder: RunFolder) -> ResumeBaseline:
 class Plot:
     """Draw the returns of runs as curves, and print them as a table, by environment and agent."""
 
-    runs: Positional[tuple[Path, ...]]
+    runs: Runs
     """Runs, folders with runs at any depth, quoted patterns like 'runs/*', or a study's files of JSON lines."""
     out: Path = Path("curves.png")
     """The picture to write."""
@@ -123,7 +125,7 @@ class Plot:
 class Stats:
     """Show how far a run is, how good, and its newest metrics."""
 
-    run: Positional[Path]
+    run: Run
     """The run's folder."""
     json: bool = False
     """Print one line of JSON, with every metric of every role."""
@@ -133,7 +135,7 @@ class Stats:
 class List:
     """List the runs in a folder and below: state, steps, return. Or those that are trained on a Ray cluster."""
 
-    folder: Positional[Path] = Path("runs")
+    folder: Annotated[Positional[Path], arg(metavar="[FOLDER]")] = Path("runs")
     """Where to look."""
     ray_address: str | None = None
     """Instead, the runs of a Ray cluster, asked from any of its nodes: auto finds the one that this machine is in."""
@@ -145,7 +147,7 @@ class List:
 class Doctor:
     """Say which stage holds a run back, by how much, and the option that changes it."""
 
-    run: Positional[Path]
+    run: Run
     """The run's folder."""
 
 
@@ -153,7 +155,7 @@ class Doctor:
 class Report:
     """Write one file about runs, for a browser without a network: curves, tables, videos, waits, differences."""
 
-    runs: Positional[tuple[Path, ...]]
+    runs: Runs
     """Runs, also of baselines, folders that hold some at any depth, or quoted patterns."""
     out: Path = Path("report.html")
     """The file to write."""
@@ -165,7 +167,7 @@ class Report:
 class Watch:
     """Show runs on a page in a browser, live; it can only be read."""
 
-    runs: Positional[tuple[Path, ...]]
+    runs: Runs
     """Runs, folders that hold some at any depth, or quoted patterns like 'runs/*'."""
     host: str = "127.0.0.1"
     """The address to serve at. Any but loopback requires the token that the printed URL has."""
@@ -177,7 +179,7 @@ class Watch:
 class Attach:
     """Watch a run that is being trained; Ctrl-C only stops watching."""
 
-    run: Positional[Path]
+    run: Run
     """The run's folder."""
 
 
@@ -185,7 +187,7 @@ class Attach:
 class Stop:
     """End a run cleanly; rmc resume continues it."""
 
-    run: Positional[Path]
+    run: Run
     """The run's folder; with --ray-address its name, as rmc list shows it."""
     ray_address: str | None = None
     """End a run of a Ray cluster, from any of its nodes: auto finds the one that this machine is in."""
@@ -197,7 +199,7 @@ class Cluster:
 
     action: Positional[Literal["up", "down"]]
     """What to do."""
-    config: Positional[Path]
+    config: Annotated[Positional[Path], arg(metavar="CONFIG")]
     """The cluster's file; deploy/cluster/ has some to start from."""
 
 

@@ -10,6 +10,7 @@ from rich.console import Console
 
 from rmc.cli.ending import format_evaluation, print_result, print_stopped
 from rmc.cli.signals import signals_caught, signals_interrupt
+from rmc.common.bus.metrics_record import is_complete
 from rmc.common.checkpoint import POLICY, CheckpointFolder
 from rmc.common.errors import CONFIG_STATUS, STOPPED_STATUS, ConfigError, RmcError
 from rmc.common.process.role import StopSignal
@@ -88,9 +89,12 @@ def _conduct(
         console.print(f"run folder {folder.path}", soft_wrap=True)
         if note := reach_note(config):
             console.print(note, soft_wrap=True)
-        if folder.result() is not None:  # no step is missing: it would be gone else
+        if (result := folder.result()) is not None:  # no step is missing: it would be gone else
             text = f"all {config.total_steps:,} steps are trained; {resume_command(folder)} --total-steps N goes on"
             console.print(text, soft_wrap=True)
+            if is_complete(result):
+                status = 0
+                return print_result(folder, console)
         by_clock = options.launcher != "lockstep"
         seconds = config.evaluator.evaluation_seconds if by_clock else 0.0
         before = _before(config, folder, seconds, console)

@@ -42,6 +42,9 @@ class Range:
     high: float
     log: bool = False
 
+    def __repr__(self) -> str:
+        return f"{self.low}..{self.high}{':log' * self.log}"
+
 
 @dataclass(frozen=True)
 class Search:

@@ -126,7 +126,7 @@ def test_its_last_state_is_played_by_rmc_evaluate(tmp_path, capsys):
     assert (_random_state(), torch.get_rng_state().tolist()) == before  # the caller's generators are left alone
     with pytest.raises(ConfigError, match="a baseline keeps its last state only"):
         api.evaluate(tmp_path / "run", checkpoint="best")
-    with pytest.raises(ConfigError, match="is a baseline's run; rmc resume continues it"):
+    with pytest.raises(ConfigError, match="is a baseline's run; only rmc evaluate"):
         api.resume(tmp_path / "run")
 
 
@@ -242,7 +242,7 @@ def test_one_in_use_is_left_as_it_is_and_can_be_stopped(tmp_path, capsys):
     command = [*COMMAND, *words, str(tmp_path / "run")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
-        while "environment step" not in (line := process.stdout.readline()):
+        while ": return " not in (line := process.stdout.readline()):
             assert line
         before = (tmp_path / "run" / "config.json").read_bytes()
         with pytest.raises(ConfigError, match="stop it first"):

@@ -346,5 +346,11 @@ def test_differences_are_those_that_matter() -> None:
     )  # type: ignore[list-item]
     assert table["columns"] == ["a", "b", "c"]
     assert table["rows"] == [["--seed", "0", "1", "1"]]
+    ours, baselines = (
+        Run("a", **{"learner.checkpoint_steps": 1_000}),
+        Run("b", **{"checkpoint_steps": 100, "env.id": "X"}),
+    )
+    beside = report.differences([ours, baselines, Run("c", **{"env.id": "Y"})])  # type: ignore[list-item]
+    assert beside["rows"] == [["--checkpoint-steps", "1 000", "100", "-"], ["ENV", "-", "X", "Y"]]
     alike = report.differences([Run("a", seed=0), Run("b", seed=0)])  # type: ignore[list-item]
     assert (alike["rows"], alike["note"]) == ([], "All options are alike.")

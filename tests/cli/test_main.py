@@ -129,6 +129,8 @@ def test_the_flags_are_these(command: str, expected: list[str], capsys: pytest.C
             )
             for option in ("--grounding=False", "--no-grounding False")
         ),
+        ("train X --lr 3", "Unrecognized options: --lr, 3 (see rmc train --help-all)"),
+        ("train X --cuda", "Unrecognized options: --cuda (see rmc train --help-all)"),
         ("trian X", "Unrecognized options: trian, X; did you mean train? (see rmc --help)"),
         (
             "resume x --if-exists new",

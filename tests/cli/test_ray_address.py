@@ -90,7 +90,7 @@ def test_auto_takes_an_address_at_which_nothing_is_any_more(
     )
 
 
-@pytest.mark.parametrize("address", ["ray://nowhere:1", "nowhere", "a:b:c"])
+@pytest.mark.parametrize("address", ["ray://nowhere:1", "nowhere", "a:b:c", "local"])
 def test_what_is_no_address_is_refused(address: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert refusal(capsys, "list", "--ray-address", address).startswith(f"rmc: --ray-address='{address}': ")
 

@@ -82,6 +82,7 @@ def test_the_untrained_policy_is_played_once(folder, monkeypatch):
     def train() -> float:
         """How often a policy was played, with the last's; what the result says of the untrained one."""
         played.clear()
+        folder.result_file.unlink(missing_ok=True)  # as where steps are missing
         assert conducted(folder) == 0
         return json.loads(folder.result_file.read_bytes())["initial_return_mean"]
 
@@ -134,7 +135,8 @@ def test_in_lockstep_no_clock_cuts_an_evaluation_and_none_counts_as_training(fol
 
     monkeypatch.setattr(evaluation, "evaluate_blob", noted)
     for launcher in ("lockstep", "local"):
-        folder.initial_file.unlink(missing_ok=True)
+        for file in (folder.initial_file, folder.result_file):
+            file.unlink(missing_ok=True)
         assert conducted(folder, launcher=launcher) == 0
     assert limits == [0.0, 0.0, 300.0, 300.0]
     between = sum(begins[after] - ends[after - 1] for after in (1, 3))
@@ -218,10 +220,14 @@ def test_a_run_that_goes_on_knows_its_steps_before_a_role_speaks(folder, monkeyp
 
 
 def test_a_finished_run_that_is_resumed_says_that_no_step_is_missing(folder):
-    output = io.StringIO()
+    output, before = io.StringIO(), []
     for times in (0, 1):
         assert conducted(folder, Console(file=output, width=200)) == 0
         assert output.getvalue().count(f"steps are trained; rmc resume {folder.path} --total-steps N goes on") == times
+        files = [path.read_bytes() for path in (folder.result_file, folder.metrics)]
+        assert times == 0 or files == before
+        before = files
+    assert output.getvalue().count("after training:  return") == 2
 
 
 def test_a_second_ctrl_c_amid_the_upload_leaves_no_lock(folder, monkeypatch):

@@ -22,6 +22,16 @@ def test_who_has_it_not_is_told_how_to_get_it() -> None:
         make_env(EnvConfig(WALKER))
 
 
+@pytest.mark.skipif(INSTALLED, reason="it is installed")
+def test_what_its_import_raises_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where MUJOCO_GL names no renderer."""
+    for name in ("shimmy", "dm_control"):
+        (tmp_path / f"{name}.py").write_text("raise RuntimeError('invalid value for environment variable MUJOCO_GL')")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ConfigError, match=r"^ENV='dm_control/walker-walk-v0': shimmy cannot be imported: Runtime.*_GL"):
+        make_env(EnvConfig(WALKER))
+
+
 @needs_dm_control
 @pytest.mark.parametrize("env_id", [WALKER, f"shimmy:{WALKER}"])
 def test_a_task_is_an_environment_like_others(env_id: str) -> None:

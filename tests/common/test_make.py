@@ -81,6 +81,12 @@ def test_what_an_environment_calls_the_parts_of_its_observation(
     assert [part["name"] for part in json.loads(json.dumps(asdict(layout)))["observations"]] == names
 
 
+def test_a_property_of_the_environments_that_raises_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(OddSpaces, "observation_structure", property(lambda _: 1 // 0), raising=False)
+    with pytest.raises(ConfigError, match=r"observation_structure raises ZeroDivisionError.*test_make"):
+        env_layout(odd("OddParts-v0", VECTOR, Box(-1.0, 1.0, (2,))))
+
+
 @pytest.mark.parametrize("hide", ["positions", "velocities"])
 @pytest.mark.parametrize(
     "told", [{"a": 1, "b": 2}, {"qpos": 3}, {"qvel": 1, "qpos": 2}, {"qpos": 0, "qvel": 3}], ids=str
@@ -182,6 +188,7 @@ def test_the_outermost_actions_are_within_the_bounds(bound: float, dtype: type) 
         (EnvConfig("HalfCheeta-v5"), "did you mean HalfCheetah-v5"),
         (EnvConfig("HalfCheetah"), "did you mean HalfCheetah-v5? One of your own"),
         (EnvConfig("Qxzzy-v9"), "no such environment"),
+        (EnvConfig("ALE/Pong-v5"), "no such environment; use a gymnasium id or module:EnvId-v0"),
         (EnvConfig("no_such_module:Thing-v0"), "No module named 'no_such_module'"),
         (EnvConfig("CartPole-v1"), "actions are Discrete"),
         (EnvConfig("tests.memory_env:Memory13-v0"), "did you mean Memory12-v0"),

@@ -203,6 +203,7 @@ def test_an_option_that_a_table_names_twice_is_refused(table: str, tmp_path: Pat
         ([PENDULUM, "--grid", "lr=1"], "grid.lr=[1]: no option"),
         ([PENDULUM, "--grid", "scheme=1,2", "--scheme", "3"], "scheme=[1, 2]: is an option of every run"),
         ([PENDULUM, "--grid", "grounding=true,false", "--no-grounding"], "grounding=[True, False]: is an option"),
+        ([PENDULUM, "--search", "foo=1..2:log"], "search.foo=1..2:log: no option"),
         ([PENDULUM, "--jobs", "-1"], "--jobs=-1: take 1 or more"),
         (
             [PENDULUM, "--init_from", "runs/a", "--launcher", "ray"],
