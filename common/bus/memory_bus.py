@@ -22,7 +22,6 @@ class MemoryBus:
     """The bus of a lockstep run: same promises, one process, no threads."""
 
     def __init__(self) -> None:
-        self._config: bytes | None = None
         self._epochs: dict[str, int] = {}
         self._streams: dict[int, dict[EntryId, bytes]] = {}
         self._last_ids: dict[int, EntryId] = {}
@@ -36,19 +35,10 @@ class MemoryBus:
         self.refused: Counter[str] = Counter()  # here, nobody writes what cannot be read
         self.dead_letters: list[tuple[Entry, str]] = []
 
-    def set_config(self, config: bytes) -> None:
-        self._config = config
-
-    def config(self) -> bytes | None:
-        return self._config
-
     def take_epoch(self, role: str, floor: int = 0) -> int:
         held = self._epochs.get(role, 0)
         self._epochs[role] = (held if floor <= held < floor + MAX_EPOCH_GAP else floor) + 1
         return self._epochs[role]
-
-    def check_room(self, role: str) -> None:
-        """There always is some."""
 
     def current_epoch(self, role: str) -> int:
         return self._epochs.get(role, 0)
@@ -155,6 +145,3 @@ class MemoryBus:
 
     def stop_requested(self) -> str | None:
         return self._stop
-
-    def clear_stop(self) -> None:
-        self._stop = None

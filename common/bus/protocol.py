@@ -95,20 +95,11 @@ class Bus(Protocol):
     refused: Counter[str]
     """What roles wrote and could not be read, by reason."""
 
-    def set_config(self, config: bytes) -> None:
-        """Register the run's config."""
-
-    def config(self) -> bytes | None:
-        """The run's config, or None where no run of this name is registered."""
-
     def take_epoch(self, role: str, floor: int = 0) -> int:
         """A new epoch of this role, larger than ``floor`` and than any taken before.
 
         At most ``MAX_EPOCH_GAP`` above ``floor``: more was counted by a stranger, and the counter is fixed.
         """
-
-    def check_room(self, role: str) -> None:
-        """Raises BusFull or BusUnavailable where what this role writes would not be taken now."""
 
     def current_epoch(self, role: str) -> int:
         """The newest epoch taken by this role; 0 before the first."""
@@ -184,6 +175,3 @@ class Bus(Protocol):
 
     def stop_requested(self) -> str | None:
         """Why the run should end, or None."""
-
-    def clear_stop(self) -> None:
-        """Forget an earlier run's stop, before its roles start again."""

@@ -37,10 +37,9 @@ class Missing(CorruptObservation):
         self._was = self._rng.random(self._chains) < now
         return self._was
 
-    def disturb(self, observation: Floats, info: dict[str, Any]) -> Floats:
+    def seen(self, observation: Floats, info: dict[str, Any]) -> tuple[Floats, dict[str, Any]]:
         missing = self.draw() if self._chains > 1 else bool(self.draw()[0])
-        info["missing"] = info.get("missing", False) | missing
-        return np.where(missing, np.float32(0.0), observation)
+        return np.where(missing, np.float32(0.0), observation), info | {"missing": info.get("missing", False) | missing}
 
 
 class Flicker(Missing):

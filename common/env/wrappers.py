@@ -192,13 +192,6 @@ class CorruptObservation(SeenWrapper):
             self._rng = np.random.default_rng([seed, self.stream])
         return super().reset(seed=seed, options=options)
 
-    def seen(self, observation: Floats, info: dict[str, Any]) -> tuple[Floats, dict[str, Any]]:
-        return self.disturb(observation, info), info
-
-    def disturb(self, observation: Floats, info: dict[str, Any]) -> Floats:
-        """(O,) as it is -> (O,) as it is seen; may say so in ``info``."""
-        raise NotImplementedError
-
 
 class Noise(CorruptObservation):
     """Independent Gaussian noise on every dimension of every observation."""
@@ -209,9 +202,9 @@ class Noise(CorruptObservation):
         super().__init__(env)
         self._deviation = deviation
 
-    def disturb(self, observation: Floats, info: dict[str, Any]) -> Floats:
+    def seen(self, observation: Floats, info: dict[str, Any]) -> tuple[Floats, dict[str, Any]]:
         noisy = observation + self._deviation * self._rng.standard_normal(observation.shape, np.float32)
-        return np.where(info.get("missing", False), observation, noisy)
+        return np.where(info.get("missing", False), observation, noisy), info
 
 
 class Delay(SeenWrapper):

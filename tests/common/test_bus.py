@@ -36,7 +36,8 @@ def bus(request, redis_url) -> Bus:
     return MemoryBus() if request.param == "memory" else RedisBus(redis_url, f"test-{uuid.uuid4().hex}")
 
 
-def test_config_and_stop(bus):
+def test_config_and_stop(redis_url):
+    bus = RedisBus(redis_url, f"test-{uuid.uuid4().hex}")
     assert bus.config() is None
     assert bus.stop_requested() is None
     bus.set_config(b"{}")

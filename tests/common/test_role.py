@@ -61,12 +61,11 @@ def test_any_other_error_ends_it_closed():
 
 
 def test_says_its_metrics_and_hears_the_stop():
-    bus, stop = MemoryBus(), StopSignal()
-    bus.request_stop("enough")
+    asked, bus, stop = MemoryBus(), MemoryBus(), StopSignal()
+    asked.request_stop("enough")
     role = Counting(stop, 45)
-    run_role(role, bus, stop)
+    run_role(role, asked, stop)
     assert (role.taken, role.closed) == (0, True)
-    bus.clear_stop()
     run_role(role, bus, stop, lambda: role.taken >= 5)
     assert bus.records({"counting": "0"})[0][-1].keys() >= {"taken", "busy_share", "waiting_share", "waiting_for"}
 
