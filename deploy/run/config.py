@@ -180,7 +180,7 @@ def _read(text: str | bytes) -> Any:
 def from_dict(kind: type[ConfigT], raw: Any, path: str) -> ConfigT:
     """A dataclass from what JSON holds of it; ``path`` is what leads there, in words. Raises ConfigError."""
     if not isinstance(raw, dict):
-        raise ConfigError(path.rstrip(". "), raw, "must be an object")
+        raise ConfigError(path.rstrip(". "), raw, f"must be an object, in Python of class {kind.__name__}")
     hints = get_type_hints(kind)
     names = {item.name for item in dataclasses.fields(kind)}  # type: ignore[arg-type]
     for name in sorted(set(raw) ^ names):

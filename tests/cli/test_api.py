@@ -39,7 +39,7 @@ def test_a_preset_takes_an_id_as_well() -> None:
     [
         ({"total_steps": 1e5}, r"total_steps=100000.0: must be int"),
         ({"seed": "1"}, r"seed='1': must be int"),
-        ({"env": "Ant-v5"}, r"env='Ant-v5': must be an object"),
+        ({"env": "Ant-v5"}, r"env='Ant-v5': must be an object, in Python of class EnvConfig"),
         ({"agent": dataclasses.replace(CONFIG.agent, head_input="all")}, r"agent.head_input='all': must be one of"),
         ({"agent": dataclasses.replace(CONFIG.agent, heads=(8, 8, 8))}, r"agent.heads=\[8, 8, 8\]: must be tuple"),
         ({"actors": np.float64(2)}, r"actors=2.0: must be int"),
@@ -205,6 +205,16 @@ def test_a_callbacks_error_is_raised_at_once_where_a_program_around_python_hears
     with pytest.raises(KeyError):
         callback({})
     assert isinstance(callback.error, KeyError)
+
+
+def test_a_callbacks_error_ends_a_run_whose_ctrl_c_is_ignored() -> None:
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with signals_caught() as stop:
+            api._Callback(lambda record: record["none"])({})
+            assert stop.requested
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_an_error_reaches_another_process_whole() -> None:
