@@ -169,7 +169,8 @@ def test_a_baseline_takes_its_own_options(tmp_path: Path, capsys: pytest.Capture
     assert "--gamma" in complaint(["resume", str(folder.path), "--gamma", "0.9"], capsys)
     assert main.run(["resume", str(folder.path), "--help"]) == 0
     assert "(default: 700)" in " ".join(capsys.readouterr().out.split())
-    assert "only rmc evaluate, plot, report, stats, watch, resume and stop take it" in complaint(["train", "--run-dir", str(folder.path)], capsys)
+    said = complaint(["train", "--run-dir", str(folder.path)], capsys)
+    assert "only rmc evaluate, plot, report, stats, watch, resume and stop take it" in said
 
 
 @pytest.mark.parametrize(
