@@ -94,7 +94,7 @@ def test_critics_of_longer_targets_are_not_compared(
     longer = dataclasses.replace(config, update=dataclasses.replace(config.update, n_step=5))
     folder = run_of(tmp_path / "run", longer)
     assert main.run(["inspect", str(folder.path), "--out", str(tmp_path / "seen.png")]) == 0
-    assert "what came: compared where --n-step is 1 and episodes end by themselves" in capsys.readouterr().out
+    assert "critics are not compared with returns: that takes --n-step 1" in capsys.readouterr().out
 
 
 def test_an_episode_that_never_ends_is_looked_at_for_a_while(
