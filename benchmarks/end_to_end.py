@@ -11,7 +11,6 @@ What results/end-to-end.jsonl has already is not run again: an interrupted bench
 
 import json
 import math
-import signal
 import statistics
 import subprocess
 import sys
@@ -78,7 +77,7 @@ def _started(words: list[str]) -> subprocess.Popen[str]:
 
 
 def _end(process: subprocess.Popen[str]) -> None:
-    process.send_signal(signal.SIGINT)
+    process.terminate()
     with suppress(subprocess.TimeoutExpired):
         process.wait(60)
     process.kill()

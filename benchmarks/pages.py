@@ -6,7 +6,6 @@ The pages are connections that read all their events, on the same two cores. Nee
 """
 
 import selectors
-import signal
 import socket
 import subprocess
 import sys
@@ -32,7 +31,7 @@ def served(run: Path) -> Iterator[int]:
         assert server.stdout is not None
         yield urlsplit(server.stdout.readline().strip()).port or 0
     finally:
-        server.send_signal(signal.SIGINT)
+        server.terminate()
         server.wait()
 
 

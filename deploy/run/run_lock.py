@@ -101,7 +101,7 @@ class RunLock:
 
     def is_held_by(self, process: int) -> bool:
         """Whether that process has the lock's file open; False where others hide theirs."""
-        with suppress(psutil.Error):
+        with suppress(psutil.Error, OSError):  # it has ended, or the run's folder has gone
             opened = [file.path for file in psutil.Process(process).open_files()]
             return any(Path(path).name == self._file.name and self._file.samefile(path) for path in opened)
         return False

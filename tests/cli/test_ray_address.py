@@ -90,9 +90,14 @@ def test_auto_takes_an_address_at_which_nothing_is_any_more(
     )
 
 
-@pytest.mark.parametrize("address", ["ray://nowhere:1", "nowhere", "a:b:c", "local"])
+@pytest.mark.parametrize("address", ["ray://nowhere:1", "nowhere", "a:b:c"])
 def test_what_is_no_address_is_refused(address: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert refusal(capsys, "list", "--ray-address", address).startswith(f"rmc: --ray-address='{address}': ")
+
+
+@pytest.mark.parametrize("words", COMMANDS[:2], ids=" ".join)
+def test_a_cluster_of_its_own_has_no_run_to_list_or_stop(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert "starts a cluster of its own, where no run is" in refusal(capsys, *words, "--ray-address", "local")
 
 
 def test_a_port_that_is_silent_or_anothers(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
