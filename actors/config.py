@@ -9,11 +9,9 @@ class EvaluatorConfig:
     """Evaluation during training."""
 
     episodes: int = 5
-    """Episodes per evaluation, played with the policy's mean, one after the other. 0 evaluates before and after
-    training alone, with no evaluator beside the actors."""
+    """Episodes per evaluation, played with the policy's mean. 0: only before and after training, with no evaluator."""
     evaluation_seconds: float = 300.0
-    """Time limit of an evaluation, in seconds; 0 is none, as in lockstep. Finished episodes count; if none finished,
-    the first one's return so far."""
+    """Seconds that an evaluation may take; 0: no limit, as in lockstep. Episodes that have ended count."""
 
 
 @dataclass(frozen=True)
@@ -25,8 +23,7 @@ class ActorConfig:
     stride: int = 0
     """Steps between window starts. Below --trained-steps windows overlap; 0 means --trained-steps, the most."""
     state_strategy: Literal["zero", "stored", "burn-in", "episode"] = "burn-in"
-    """A window's first memory state. zero: zeros. stored: the actor's. burn-in: the actor's, some steps before.
-    episode: zeros; the window is the whole episode, up to the time limit."""
+    """A window's first state: zero; stored, the actor's; burn-in, the actor's some steps before; episode, its start."""
     reward_scale: float = 1.0
     """Factor on the rewards that are learnt from; reported returns are unscaled."""
     refresh_steps: int = 400

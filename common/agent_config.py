@@ -24,27 +24,21 @@ class AgentConfig:
     gate_init: Literal["uniform", "chrono"] = "uniform"
     """Initial bias of the GRU's update gates. uniform: PyTorch's. chrono: time constants up to a window's length."""
     head_input: HeadInput = "hidden"
-    """What the heads read: the hidden state; the observation beside it; or the observation alone, an agent without a
-    memory."""
+    """What the heads read: the hidden state; the observation beside it; or the observation alone, without a memory."""
     critic_batch_norm: bool = False
     """Batch norm in the critics, as CrossQ has it: Q of this and the next state share one pass; no target critics."""
     privileged_critic: bool = False
-    """The critics, and nothing else, also read the environment's info["privileged"]. Where it gives none, that is the
-    observation before any option takes from it."""
+    """Critics alone also read info["privileged"], or the observation before any option takes from it."""
     normalize_observations: bool = False
     """Observations are normalised by the replay server's running statistics."""
     grounding: bool = True
     """The world model also predicts the next observation's change and the reward."""
     missing_flag: bool = False
-    """The memory has one more input, which says whether the observation is missing (flickered out). Where dimensions
-    are missing one by one, it has one for each."""
+    """The memory also reads whether the observation is missing, or which of its dimensions are."""
     impute_missing: bool = False
-    """A small network fills a missing observation before the memory reads it. It predicts from the observation before
-    (filled itself if it was missing), the memory and the last action. The stored state then is h and that observation.
-    Needs normalized observations."""
+    """A small network fills missing observations before the memory reads them. Needs normalized observations."""
     initial_priority: Literal["max", "actor"] = "max"
-    """Priority that a window enters a prioritized replay with: the largest there, or the TD error that its actor
-    computes. For the latter, actors are sent the critics, too."""
+    """A window's first priority: the largest there, or its actor's TD error; actors are sent the critics for that."""
 
     def input_size(self, obs_dim: int, action_dim: int, missing: int) -> int:
         """Numbers that the memory reads at a step, before the embedding: o_t, a_{t-1}, and M flags where asked."""

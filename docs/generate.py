@@ -1,13 +1,11 @@
 """Writes docs/configuration.md from the options' dataclasses: ``make docs``. A test asks whether it is up to date."""
 
-import ast
 import dataclasses
-import importlib
-import inspect
-import itertools
 from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from docstring_parser import parse_from_object
 
 from rmc.analysis.report import words
 from rmc.cli.train_options import Train
@@ -133,8 +131,9 @@ WHEN = {
     "checkpoint_steps": "down to see more evaluations",
     "keep_checkpoints": "up to go back further; the best is always kept",
     "precision": "`fp32` to avoid rounding; an update then runs at 0.37 to 0.56 of the speed on a CPU with bfloat16",
-    "threads": "1 to leave a core to other runs; more where cores are free",
-    "evaluation_seconds": "up where an episode takes minutes",
+    "threads": "1 to leave a core to other runs; more where cores are free. On Ray and in lockstep 0 is 1. In lockstep "
+    "and on a GPU there is one process",
+    "evaluation_seconds": "up where an episode takes minutes: if none has ended, the first one's return so far counts",
     "episodes": "up for less noise in what is called the best checkpoint; 0 where one environment alone can exist",
 }
 
@@ -201,15 +200,8 @@ def _takes(hint: Any, limits: tuple[float, float] | None) -> str:
 
 
 def _docstrings(kind: type[Any]) -> dict[str, str]:
-    """What stands under each field in the source."""
-    tree = ast.parse(inspect.getsource(importlib.import_module(kind.__module__)))
-    body = next(node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == kind.__name__).body
-    docstrings = {}
-    for field, after in itertools.pairwise(body):
-        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(after, ast.Expr):
-            assert isinstance(after.value, ast.Constant)
-            docstrings[field.target.id] = " ".join(str(after.value.value).split())
-    return docstrings
+    """What stands under each field in the source, which the help shows, too."""
+    return {text.arg_name: text.description or "" for text in parse_from_object(kind).params}
 
 
 if __name__ == "__main__":

@@ -38,14 +38,11 @@ class UpdateConfig:
     curiosity_steps: int = 100_000
     """Agent steps after which beta has decayed to 0, linearly."""
     scheme: Literal[1, 2, 3, 4, 5, 6] = 1
-    """Whose losses train the memory. 1: model and value, 2: value, 3: model, 4: all, 5: model and policy,
-    6: value and policy (table 1 of the paper)."""
+    """What trains the memory: 1 model and value, 2 value, 3 model, 4 all, 5 model and policy, 6 value and policy."""
     policy_through_q: bool = True
-    """In schemes 4 to 6 the policy's loss reaches the memory by the state that Q reads, too, not only by its own
-    input."""
+    """In schemes 4 to 6 the policy's loss reaches the memory by the state that Q reads, too."""
     update_order: Literal["joint", "alternate"] = "joint"
-    """joint: one step from all losses together. alternate: one loss after the other, each with an optimiser of its own
-    (algorithm 1 as printed)."""
+    """joint: one step of all losses. alternate: one loss after the other, each with its optimiser (algorithm 1)."""
     model_norm: Literal["l1", "l2"] = "l1"
     """How the world model's error is measured, as loss and as curiosity."""
     policy_delay: int = 1
@@ -56,8 +53,7 @@ class UpdateConfig:
     """Weight of the largest against the mean absolute TD error in a window's priority."""
 
     policy_ema_updates: int = 0
-    """Time constant, in updates, of the moving average of the policy that is saved and evaluated; at most a tenth of
-    those made. 0: off."""
+    """Updates that the saved and evaluated policy averages over, a tenth of those made at most; 0: off."""
 
     def halves_are_apart(self) -> bool:
         """Whether memory and world model read nothing of critics, policy and temperature, nor of a common norm."""
@@ -84,8 +80,6 @@ class LearnerConfig:
     keep_checkpoints: int = 3
     """Newest checkpoints kept, beside the best."""
     precision: Precision = "auto"
-    """Matrix products in bfloat16 or float32; auto: bfloat16 where the CPU has instructions for it, TensorFloat-32 on a
-    GPU."""
+    """Of matrix products. auto: bfloat16 where the CPU has instructions for it, TensorFloat-32 on a GPU."""
     threads: int = 0
-    """CPU threads of the learner. 0 tries 1, 2, 4 … and keeps the fastest; 1 on Ray and in lockstep. With 2 or more, or
-    0 on several cores, scheme 3 trains in two processes; not in lockstep or on a GPU."""
+    """The learner's CPU threads; 0 finds the fastest number. From 2 on, scheme 3 trains in two processes."""

@@ -34,15 +34,13 @@ class LaunchOptions:
     device: str = "cpu"
     """The learner's device: cpu, cuda or cuda:N."""
     redis_url: str | None = None
-    """A Redis of your own: unix:///path, redis://host:port, rediss://… or file:PATH, a file with the URL; by
-    default an embedded one."""
+    """Your own Redis: unix:///path, redis://host:port, rediss://… or file:PATH with the URL. None: an embedded one."""
     ray_address: str = "auto"
     """With --launcher ray: auto finds the cluster that this machine is in, local starts one for this run alone."""
     all_cpus: bool = False
     """With --launcher ray: an actor for every CPU left, also of nodes that join later, in place of --actors."""
     tls: bool = False
-    """With --launcher ray: encrypt what the roles say across machines; needs a Redis server built with TLS on the
-    head."""
+    """With --launcher ray: encrypt what crosses machines. The head's Redis server must be built with TLS."""
     track: TrackerName | Literal["off"] | None = None
     """Log to a tracker. The default is the run's last choice, and none for a new run."""
     track_project: str | None = None

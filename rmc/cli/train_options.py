@@ -58,8 +58,7 @@ class Train(LaunchOptions, RunConfig):
     config_file: Annotated[Path | None, tyro.conf.arg(name="config")] = None
     """A TOML file of options, like env = "HalfCheetah-v5" and learning_rate = 3e-4; those given beside it win."""
     dry_run: bool = False
-    """Train for some seconds in a temporary folder, and tell what the run needs and this machine has. The exit
-    status is 1 where it does not fit."""
+    """Train for seconds in a temporary folder, and tell whether the run fits here; the exit status is 1 if not."""
 
     def config(self) -> RunConfig:
         """The run's config."""

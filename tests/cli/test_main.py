@@ -9,11 +9,14 @@ import stat
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
+from dataclasses import is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import psutil
 import pytest
+from docstring_parser import parse_from_object
 
 from rmc.cli import main, parser, train_options
 from rmc.cli.training import open_folder
@@ -103,6 +106,20 @@ def flags(command: str, capsys: pytest.CaptureFixture[str]) -> set[str]:
 def test_the_flags_are_these(command: str, expected: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     options = flags(command, capsys)
     assert {flag for flag in options if not flag.startswith("--no-")} == set(expected)
+
+
+def classes(kind: type) -> Iterator[type]:
+    """A command's dataclass, and those of its parts and subcommands."""
+    yield kind
+    for hint in get_type_hints(kind).values():
+        yield from (one for part in (hint, *get_args(hint)) if is_dataclass(part) for one in classes(part))
+
+
+@pytest.mark.parametrize("command", parser.COMMANDS)
+def test_a_help_text_breaks_at_no_line_of_its_source(command: str) -> None:
+    for kind in classes(parser.COMMANDS[command][0]):
+        texts = {text.arg_name: text.description or "" for text in parse_from_object(kind).params}
+        assert [name for name, text in texts.items() if "\n" in text] == [], kind
 
 
 @pytest.mark.parametrize(
