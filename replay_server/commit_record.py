@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 
 from rmc.common.bus.protocol import EntryId
 from rmc.common.errors import ConfigError
+from rmc.common.replay import ObservationStatistics
+from rmc.common.window import WindowSpec
 
 MAX_STREAMS = 4096
 MOST = 2**62  # of a counter that a bus has kept: who adds to it must not overflow
@@ -39,8 +41,7 @@ class StreamPosition(NamedTuple):
 class Progress:
     """The replay's counters. Mutable: the server changes it, then commits it."""
 
-    statistics: int  # D
-    counts: int  # C
+    observed: ObservationStatistics
     valid_from: int = 0  # the oldest serial that may be sampled
     next_serial: int = 0
     env_steps: int = 0  # inserted
@@ -52,17 +53,8 @@ class Progress:
     begun_env_steps: int = 0  # agent steps that were in before this ring began, empty
     begun_drawn_steps: int = 0  # and trained steps that were drawn, from all shards
     max_priority: float = 1.0  # a new window's
-    observations: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))  # (C,), of the statistics
-    total: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))  # (D,)
-    total_square: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))  # (D,)
     streams: dict[int, StreamPosition] = field(default_factory=dict)
     replay_ratio: float = 0.0  # that the limiter held since this ring began; 0 where nobody has said it
-
-    def __post_init__(self) -> None:
-        if not self.total.size:
-            self.total, self.total_square = np.zeros(self.statistics), np.zeros(self.statistics)
-        if not self.observations.size:
-            self.observations = np.zeros(self.counts, np.int64)
 
     @property
     def windows(self) -> int:
@@ -91,12 +83,12 @@ class Progress:
         counters = _COUNTERS.pack(
             self.valid_from, self.next_serial, self.env_steps, self.drawn_steps, self.draws, self.replay_epoch,
             self.evicted_priorities, self.elsewhere_steps, self.begun_env_steps, self.begun_drawn_steps,
-            self.max_priority, int(self.observations[0]), len(self.streams),
+            self.max_priority, int(self.observed.count[0]), len(self.streams),
         )  # fmt: skip
         rows = [(actor, at.id.epoch, at.id.seq, at.settled_steps) for actor, at in self.streams.items()]
         streams = np.array(rows, np.int64).tobytes()
-        sums, further = self.total.tobytes() + self.total_square.tobytes(), self.observations[1:].tobytes()
-        return counters + sums + streams + _RATIO.pack(self.replay_ratio) + further
+        sums = self.observed.total.tobytes() + self.observed.total_square.tobytes()
+        return counters + sums + streams + _RATIO.pack(self.replay_ratio) + self.observed.count[1:].tobytes()
 
     def publish(self) -> bytes:
         """The same for a bus and for files, with a CRC-32 in front."""
@@ -109,23 +101,20 @@ def crc_matches(published: bytes) -> bool:
     return published[: _CRC.size] == _CRC.pack(zlib.crc32(published[_CRC.size :]))
 
 
-def decode_progress(payload: bytes, statistics: int, counts: int) -> Progress:
+def decode_progress(payload: bytes, spec: WindowSpec) -> Progress:
     """The inverse of ``Progress.encode``, for bytes whose CRC was right."""
     *counters, observations, streams = _COUNTERS.unpack_from(payload)
-    sums = np.frombuffer(payload, np.float64, 2 * statistics, _COUNTERS.size).reshape(2, statistics).copy()
+    sums = np.frombuffer(payload, np.float64, 2 * spec.statistics, _COUNTERS.size).reshape(2, -1).copy()
     table = np.frombuffer(payload, np.int64, 4 * streams, _COUNTERS.size + sums.nbytes).reshape(-1, 4)
     positions = {actor: StreamPosition(EntryId(epoch, seq), steps) for actor, epoch, seq, steps in table.tolist()}
-    progress = Progress(statistics, counts, *counters)
-    progress.total, progress.total_square, progress.streams = sums[0], sums[1], positions
     rest = payload[_COUNTERS.size + sums.nbytes + table.nbytes :]
-    progress.replay_ratio = _RATIO.unpack_from(rest)[0] if rest else 0.0
-    further = np.frombuffer(rest[_RATIO.size :], np.int64)
-    progress.observations = np.concatenate([np.array([observations]), further])
-    return progress
+    count = np.array([observations, *np.frombuffer(rest[_RATIO.size :], np.int64)])
+    ratio = _RATIO.unpack_from(rest)[0] if rest else 0.0
+    return Progress(ObservationStatistics(count, *sums), *counters, streams=positions, replay_ratio=ratio)
 
 
-def decode_published(published: bytes, statistics: int, counts: int) -> Progress | None:
-    """``Progress.publish`` as a bus has kept it; None where it is damaged, or no ring of such observations says it."""
+def decode_published(published: bytes, spec: WindowSpec) -> Progress | None:
+    """``Progress.publish`` as a bus has kept it; None where it is damaged, or no ring of such windows says it."""
     payload = published[_CRC.size :]
     if not crc_matches(published) or len(payload) < _COUNTERS.size:
         return None
@@ -134,26 +123,25 @@ def decode_published(published: bytes, statistics: int, counts: int) -> Progress
     valid_from, next_serial, *_ = counters
     if not (in_range and valid_from <= next_serial and math.isfinite(max_priority) and max_priority > 0.0):
         return None
-    size = _COUNTERS.size + 16 * statistics + streams * _STREAM_BYTES
-    without_ratio = [size] if counts == 1 else []
-    if len(payload) not in [*without_ratio, size + _RATIO.size + 8 * (counts - 1)]:
+    size = _COUNTERS.size + 16 * spec.statistics + streams * _STREAM_BYTES
+    without_ratio = [size] if spec.counts == 1 else []
+    if len(payload) not in [*without_ratio, size + _RATIO.size + 8 * (spec.counts - 1)]:
         return None
-    return decode_progress(payload, statistics, counts)
+    return decode_progress(payload, spec)
 
 
-def record_bytes(statistics: int, counts: int) -> int:
+def record_bytes(spec: WindowSpec) -> int:
     """Room for one copy, in whole pages. A ratio always fits: without it the size is never a multiple of 16."""
-    further = _RATIO.size + 8 * (counts - 1) if counts > 1 else 0
-    size = _HEADER.size + _COUNTERS.size + 16 * statistics + further + MAX_STREAMS * _STREAM_BYTES
+    further = _RATIO.size + 8 * (spec.counts - 1) if spec.counts > 1 else 0
+    size = _HEADER.size + _COUNTERS.size + 16 * spec.statistics + further + MAX_STREAMS * _STREAM_BYTES
     return -(-size // 4096) * 4096
 
 
 class RecordPair:
-    """Both copies, in a mapped region of ``2 * record_bytes(statistics, counts)`` bytes."""
+    """Both copies, in a mapped region of ``2 * record_bytes(spec)`` bytes."""
 
-    def __init__(self, region: NDArray[np.uint8], statistics: int, counts: int) -> None:
-        self._statistics, self._counts = statistics, counts
-        half = record_bytes(statistics, counts)
+    def __init__(self, region: NDArray[np.uint8], spec: WindowSpec) -> None:
+        self._spec, half = spec, record_bytes(spec)
         self._copies = [region[:half].data, region[half : 2 * half].data]
         self._sequence = 0
 
@@ -172,7 +160,7 @@ class RecordPair:
         if not copies:
             return None
         self._sequence, payload = max(copies)
-        return decode_progress(payload, self._statistics, self._counts)
+        return decode_progress(payload, self._spec)
 
 
 def _read_copy(copy: memoryview) -> tuple[int, bytes | None]:

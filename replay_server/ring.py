@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rmc.common.errors import ConfigError
+from rmc.common.replay import ObservationStatistics
 from rmc.common.row_checksum import add_checksums, whole_rows
 from rmc.common.window import Rows, Slots, WindowSpec
 from rmc.replay_server.commit_record import Progress, RecordPair, record_bytes
@@ -110,11 +111,11 @@ class Ring:
 
 
 def _rows_start(spec: WindowSpec) -> int:
-    return _IDENTITY_BYTES + 2 * record_bytes(spec.statistics, spec.counts)
+    return _IDENTITY_BYTES + 2 * record_bytes(spec)
 
 
 def _records(head: NDArray[np.uint8], spec: WindowSpec) -> RecordPair:
-    return RecordPair(head.view(np.ndarray)[_IDENTITY_BYTES:], spec.statistics, spec.counts)
+    return RecordPair(head.view(np.ndarray)[_IDENTITY_BYTES:], spec)
 
 
 def file_bytes(spec: WindowSpec, capacity: int) -> int:
@@ -131,7 +132,7 @@ def _create(path: Path, spec: WindowSpec, capacity: int) -> None:
     """Under another name first, so that a ring is there whole or not at all."""
     temporary = path.with_suffix(".tmp")
     reserve(temporary, file_bytes(spec, capacity), capacity)
-    _write_head(temporary, spec, capacity, Progress(spec.statistics, spec.counts))
+    _write_head(temporary, spec, capacity, Progress(ObservationStatistics.none(spec)))
     temporary.rename(path)
 
 

@@ -111,9 +111,7 @@ class ReplayServer:
         self._store.set_priorities(slots, priorities.astype(np.float32))
         progress.max_priority = max(progress.max_priority, float(initial.max(initial=0.0)))
         progress.env_steps += int(rows["new_steps"].sum())
-        progress.observations += sums.count
-        progress.total += sums.total
-        progress.total_square += sums.total_square
+        progress.observed += sums
         progress.streams = batch.positions
         ring.commit(len(rows))
         self._measure_lag(rows)
@@ -205,9 +203,7 @@ class ReplayServer:
 
     def statistics(self) -> ObservationStatistics:
         """Running sums over all observations inserted so far."""
-        progress = self._store.ring.progress
-        count, total, total_square = progress.observations, progress.total, progress.total_square
-        return ObservationStatistics(count.copy(), total.copy(), total_square.copy())
+        return self._store.ring.progress.observed
 
     def episode(self, serial: int) -> Rows | None:
         """The windows of one episode from its start to that one; None where not all are there."""

@@ -36,7 +36,7 @@ def _take_epoch(bus: Bus, name: str, spec: WindowSpec, at_least: int) -> tuple[i
 
 def _read_published(bus: Bus, name: str, spec: WindowSpec) -> Progress | None:
     published = bus.progress(name)
-    newest = decode_published(published, spec.statistics, spec.counts) if published else None
+    newest = decode_published(published, spec) if published else None
     if published and newest is None:
         log.warning("%s: the counters that were published are damaged; going on from the ring's", name)
     return newest

@@ -8,11 +8,15 @@ import pytest
 
 from rmc.common.bus.memory_bus import MemoryBus
 from rmc.common.bus.protocol import Ack, EntryId, ReplayOwner
+from rmc.common.replay import ObservationStatistics
 from rmc.deploy.redis.progress_backup import ProgressBackup
 from rmc.deploy.run.folder import RunFolder
 from rmc.replay_server.commit_record import Progress
+from tests.replay_server.support import SPEC
 
-COUNTED, FIRST, SECOND, NEWER = (Progress(3, 1, env_steps=steps).publish() for steps in (7, 1, 2, 9))
+COUNTED, FIRST, SECOND, NEWER = (
+    Progress(ObservationStatistics.none(SPEC), env_steps=steps).publish() for steps in (7, 1, 2, 9)
+)
 WHOLE = msgpack.packb({"replay": COUNTED})
 OTHERS = ([1], {"replay": 5}, {"replay": {}}, {"another": b"x"}, {None: b"x"})
 DAMAGED = {

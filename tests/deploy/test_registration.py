@@ -17,6 +17,7 @@ from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import BusUnavailable, ConfigError
 from rmc.common.process.role import StopSignal
+from rmc.common.replay import ObservationStatistics
 from rmc.deploy.local import launcher
 from rmc.deploy.local.role_process import Process
 from rmc.deploy.monitor.monitor import Monitor
@@ -28,9 +29,10 @@ from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.presets import debug
 from rmc.replay_server.commit_record import Progress
 from tests import habits
+from tests.replay_server.support import SPEC
 
 CONFIG = debug(EnvConfig("Pendulum-v1"))
-COUNTED = Progress(3, 1, env_steps=7).publish()
+COUNTED = Progress(ObservationStatistics.none(SPEC), env_steps=7).publish()
 
 
 @pytest.fixture(autouse=True)

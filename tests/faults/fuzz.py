@@ -25,6 +25,7 @@ from rmc.common.bus.metrics_record import decode_record, encode_record
 from rmc.common.bus.weight_store import join_pieces
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError, MessageError
+from rmc.common.replay import ObservationStatistics
 from rmc.common.wire import HEADER, Kind, decode_header, decode_meta, encode_frame, encode_windows
 from rmc.deploy.run.config import from_json, from_registration, to_json, to_registration
 from rmc.deploy.run.presets import robust
@@ -117,7 +118,7 @@ def request(raw: bytes) -> None:
 
 def published(raw: bytes) -> None:
     """Counters that a replay server begins with."""
-    decode_published(raw, SPEC.obs_dim, 1)
+    decode_published(raw, SPEC)
 
 
 def _request(kind: Kind, meta: dict[str, int]) -> bytes:
@@ -145,7 +146,7 @@ KINDS: dict[str, tuple[bytes, Reader]] = {
     "record": (encode_record({"time": 1.5, "updates": 7, "waiting_for": "credit"}), decode_record),
     "config": (to_json(robust(EnvConfig("HalfCheetah-v5"))).encode(), from_json),
     "registration": (to_registration(robust(EnvConfig("HalfCheetah-v5"))), from_registration),
-    "counters": (Progress(SPEC.obs_dim, 1).publish(), published),
+    "counters": (Progress(ObservationStatistics.none(SPEC)).publish(), published),
 }
 
 

@@ -59,7 +59,7 @@ def on_disk(place: Path) -> Kept:
         "windows": progress.next_serial,
         "drawn_steps": progress.drawn_steps,
         "draws": progress.draws,
-        "normaliser's observations": int(progress.observations[0]),
+        "normaliser's observations": int(progress.observed.count[0]),
         "priorities learnt": int(np.count_nonzero(learnt)),
         "learner's update": checkpoint[0] if checkpoint is not None else 0,
     }

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from rmc.common.bus.protocol import EntryId
 from rmc.common.errors import ConfigError
+from rmc.common.replay import ObservationStatistics
 from rmc.common.window import WindowSpec, fingerprint
 from rmc.replay_server import former_rows
 from rmc.replay_server.commit_record import (
@@ -80,7 +81,7 @@ def test_killed_anywhere(capacity: int, appends: list[tuple[int, str]]) -> None:
 def tear_newest_record(path: Path) -> None:
     """As if the process had been killed amid the record's last bytes."""
     raw = bytearray(path.read_bytes())
-    half = record_bytes(SPEC.obs_dim, 1)
+    half = record_bytes(SPEC)
     newest = max(range(2), key=lambda copy: struct.unpack_from("<Q", raw, RECORDS_START + copy * half)[0])
     raw[RECORDS_START + newest * half + 30] ^= 0xFF
     with path.open("r+b") as file:  # in place: the map of the living ring sees it, too
@@ -98,23 +99,25 @@ def tear_newest_record(path: Path) -> None:
 )
 def test_progress_survives_the_round_trip(numbers: list[int], streams: dict[int, tuple[int, int, int]]) -> None:
     *counters, observations = numbers
-    progress = Progress(SPEC.obs_dim, 1, *counters, max_priority=3.5, observations=np.array([observations]))
-    progress.total += [1.0, 2.0, 3.0]
+    progress = Progress(
+        ObservationStatistics(np.array([observations]), np.arange(3.0), np.ones(3)), *counters, max_priority=3.5
+    )
     progress.replay_ratio = 0.1
     progress.streams = {actor: StreamPosition(EntryId(e, s), n) for actor, (e, s, n) in streams.items()}
-    again = decode_progress(progress.encode(), SPEC.obs_dim, 1)
+    again = decode_progress(progress.encode(), SPEC)
     assert again.encode() == progress.encode()
     assert again.streams == progress.streams
-    assert again.total.tolist() == [1.0, 2.0, 3.0]
+    assert again.observed.total.tolist() == [0.0, 1.0, 2.0]
     assert again.replay_ratio == 0.1
-    assert decode_progress(progress.encode()[:-8], SPEC.obs_dim, 1).replay_ratio == 0.0  # as of config format 1
+    assert decode_progress(progress.encode()[:-8], SPEC).replay_ratio == 0.0  # as of config format 1
 
 
 @pytest.mark.parametrize("obs_dim", [1, 3, 248, 249, 376])
 def test_most_streams_and_the_ratio_fit_into_a_record(obs_dim: int) -> None:
-    progress = Progress(obs_dim, 1, replay_ratio=4.0)
+    spec = dataclasses.replace(SPEC, obs_dim=obs_dim)
+    progress = Progress(ObservationStatistics.none(spec), replay_ratio=4.0)
     progress.streams = {actor: StreamPosition(EntryId(1, 0), 0) for actor in range(4096)}
-    records = RecordPair(np.zeros(2 * record_bytes(obs_dim, 1), np.uint8), obs_dim, 1)
+    records = RecordPair(np.zeros(2 * record_bytes(spec), np.uint8), spec)
     records.write(progress)
     read = records.read()
     assert read is not None
@@ -124,20 +127,20 @@ def test_most_streams_and_the_ratio_fit_into_a_record(obs_dim: int) -> None:
 @pytest.mark.parametrize("commits", [3, 4])
 def test_after_a_restart_the_older_record_is_replaced(commits: int) -> None:
     """Were it the newer one, a crash before the next commit would take the ring back by some."""
-    region = np.zeros(2 * record_bytes(SPEC.obs_dim, 1), np.uint8)
-    records = RecordPair(region, SPEC.obs_dim, 1)
+    region = np.zeros(2 * record_bytes(SPEC), np.uint8)
+    records = RecordPair(region, SPEC)
     for number in range(1, commits + 1):
-        records.write(Progress(SPEC.obs_dim, 1, draws=number))
+        records.write(Progress(NOTHING, draws=number))
     for number in (commits, commits + 1):
-        again = RecordPair(region, SPEC.obs_dim, 1)
+        again = RecordPair(region, SPEC)
         read = again.read()
         assert read is not None
         assert read.draws == number
-        again.write(Progress(SPEC.obs_dim, 1, draws=number + 1))
+        again.write(Progress(NOTHING, draws=number + 1))
 
 
 def test_too_many_streams() -> None:
-    progress = Progress(SPEC.obs_dim, 1)
+    progress = Progress(NOTHING)
     progress.streams = {actor: StreamPosition(EntryId(1, 0), 0) for actor in range(4097)}
     with pytest.raises(ConfigError, match="--actors=4097"):
         progress.encode()
@@ -159,7 +162,7 @@ def test_damage_is_named(tmp_path: Path, damage: str) -> None:
     if damage == "identity":
         raw[3] ^= 1
     if damage == "records":
-        size = 2 * record_bytes(SPEC.obs_dim, 1)
+        size = 2 * record_bytes(SPEC)
         raw[RECORDS_START : RECORDS_START + size] = bytes(size)
     (tmp_path / "ring").write_bytes(raw[:-1] if damage == "short" else raw)
     with pytest.raises(ConfigError, match=r"--run-dir=.*delete"):
@@ -179,50 +182,49 @@ def test_space_is_taken_at_once(tmp_path: Path) -> None:
     assert status.st_blocks * 512 >= status.st_size > 5000 * SPEC.dtype.itemsize
 
 
-ALL = dataclasses.replace(SPEC, missing=3, privileged=2)
+NOTHING = ObservationStatistics.none(SPEC)
+ALL, FIVE = dataclasses.replace(SPEC, missing=3, privileged=2), dataclasses.replace(SPEC, obs_dim=5)
 
 
 def test_counts_by_number_survive_the_round_trip_and_fit_into_a_record() -> None:
-    size, counts = ALL.statistics, ALL.counts
-    assert (size, counts) == (5, 5)
-    progress = Progress(size, counts, replay_ratio=4.0, observations=np.arange(1, 6))
-    progress.streams = {actor: StreamPosition(EntryId(1, 0), 0) for actor in range(4096)}
-    for dims in (size, 165, 166, 376):
-        records = RecordPair(np.zeros(2 * record_bytes(dims, dims), np.uint8), dims, dims)
-        many = dataclasses.replace(
-            progress, statistics=dims, counts=dims, observations=np.arange(dims), total=np.ones(dims),
-            total_square=np.ones(dims),
-        )  # fmt: skip
-        records.write(many)
+    assert (ALL.statistics, ALL.counts) == (5, 5)
+    streams = {actor: StreamPosition(EntryId(1, 0), 0) for actor in range(4096)}
+    for dims in (5, 165, 166, 376):
+        spec = dataclasses.replace(ALL, obs_dim=dims - 2, missing=dims - 2)
+        observed = ObservationStatistics(np.arange(dims), np.ones(dims), np.ones(dims))
+        progress = Progress(observed, streams=streams, replay_ratio=4.0)
+        records = RecordPair(np.zeros(2 * record_bytes(spec), np.uint8), spec)
+        records.write(progress)
         read = records.read()
         assert read is not None
-        assert read.encode() == many.encode()
-        assert read.observations.tolist() == list(range(dims))
-    assert decode_published(progress.publish(), size, counts) is not None
-    assert decode_published(progress.publish(), size, 1) is None  # of other windows
-    assert decode_published(Progress(size, 1).publish(), size, counts) is None
+        assert read.encode() == progress.encode()
+        assert read.observed.count.tolist() == list(range(dims))
+    by_number, one_count = (Progress(ObservationStatistics.none(spec)).publish() for spec in (ALL, FIVE))
+    assert decode_published(by_number, ALL) is not None
+    assert decode_published(by_number, FIVE) is None  # of other windows
+    assert decode_published(one_count, ALL) is None
 
 
 @pytest.mark.parametrize(
     "senseless",
     [
         {"next_serial": -7}, {"replay_epoch": 2**63 - 1}, {"max_priority": math.nan}, {"max_priority": 0.0},
-        {"valid_from": 9, "next_serial": 8}, {"observations": np.array([-1])},
+        {"valid_from": 9, "next_serial": 8}, {"observed": dataclasses.replace(NOTHING, count=np.array([-1]))},
     ],
 )  # fmt: skip
 def test_counters_that_no_ring_says_are_damaged(senseless: dict[str, Any]) -> None:
     """Whoever can write to the run's Redis can give them a right checksum."""
-    assert decode_published(Progress(3, 1, next_serial=8).publish(), 3, 1) is not None
-    assert decode_published(Progress(3, 1, **senseless).publish(), 3, 1) is None
+    assert decode_published(Progress(NOTHING, next_serial=8).publish(), SPEC) is not None
+    assert decode_published(Progress(**{"observed": NOTHING} | senseless).publish(), SPEC) is None
 
 
 def test_a_negative_number_of_streams_is_damaged() -> None:
-    payload = bytearray(Progress(3, 1).encode())
+    payload = bytearray(Progress(NOTHING).encode())
     streams = len(payload) - 6 * 8 - 8 - 8  # before the sums and the ratio
     assert struct.unpack_from("<q", payload, streams) == (0,)
     struct.pack_into("<q", payload, streams, -1)
     del payload[-4 * 8 :]  # as long as so many streams make it
-    assert decode_published(struct.pack("<I", zlib.crc32(payload)) + payload, 3, 1) is None
+    assert decode_published(struct.pack("<I", zlib.crc32(payload)) + payload, SPEC) is None
 
 
 @pytest.mark.parametrize("missing", ["missing", "blank"])
@@ -278,9 +280,9 @@ def write_former_ring(path: Path, missing: str, rows: np.ndarray, capacity: int)
         slot["serial"] = serial
     identity = struct.pack("<8s16sQQ", b"RMCRING3", fingerprint(SPEC, dtype).encode(), capacity, dtype.itemsize)
     identity += struct.pack("<I", zlib.crc32(identity))
-    records = np.zeros(2 * record_bytes(SPEC.obs_dim, 1), np.uint8)
-    progress = Progress(SPEC.obs_dim, 1, next_serial=len(rows), valid_from=max(0, len(rows) - capacity), env_steps=77)
-    RecordPair(records, SPEC.obs_dim, 1).write(progress)
+    records = np.zeros(2 * record_bytes(SPEC), np.uint8)
+    progress = Progress(NOTHING, next_serial=len(rows), valid_from=max(0, len(rows) - capacity), env_steps=77)
+    RecordPair(records, SPEC).write(progress)
     path.write_bytes(identity.ljust(RECORDS_START, b"\0") + records.tobytes() + kept.tobytes())
 
 
