@@ -109,8 +109,9 @@ def decode_progress(payload: bytes, spec: WindowSpec) -> Progress:
     positions = {actor: StreamPosition(EntryId(epoch, seq), steps) for actor, epoch, seq, steps in table.tolist()}
     rest = payload[_COUNTERS.size + sums.nbytes + table.nbytes :]
     count = np.array([observations, *np.frombuffer(rest[_RATIO.size :], np.int64)])
-    ratio = _RATIO.unpack_from(rest)[0] if rest else 0.0
-    return Progress(ObservationStatistics(count, *sums), *counters, streams=positions, replay_ratio=ratio)
+    progress = Progress(ObservationStatistics(count, *sums), *counters)
+    progress.streams, progress.replay_ratio = positions, _RATIO.unpack_from(rest)[0] if rest else 0.0
+    return progress
 
 
 def decode_published(published: bytes, spec: WindowSpec) -> Progress | None:
