@@ -11,6 +11,7 @@ STUDY = Study(
     {
         "RMC": "train ENV --flicker 0.5",
         "RMC, target entropy -A": earlier("--flicker 0.5"),
+        "RMC, privileged critic": "train ENV --flicker 0.5 --privileged-critic",
         "RMC, an update a step": earlier("--flicker 0.5 --replay-ratio 240"),
         "RMC, 1e-3": earlier(
             "--flicker 0.5 --learning-rate 1e-3 --alpha-learning-rate 1e-3 --memory-learning-scale 0.3"
