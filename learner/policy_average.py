@@ -14,11 +14,14 @@ MOVE_UPDATES = 10  # updates between moves, which read and write all that acts
 
 
 class PolicyAverage:
-    """Its time constant is so many updates, early on a tenth of those made; with 0 it is the newest parameters."""
+    """Its time constant is so many updates, early on a tenth of those made.
+
+    With fewer than ``MOVE_UPDATES`` it is the newest parameters.
+    """
 
     def __init__(self, agent: Agent, updates: int) -> None:
         self._agent, self._updates = agent, updates
-        averaged = agent.acting() if updates else {}
+        averaged = agent.acting() if updates >= MOVE_UPDATES else {}
         self._values = {name: value.detach().clone() for name, value in averaged.items()}
 
     @torch.no_grad()

@@ -130,7 +130,8 @@ def _progress(spec: WindowSpec, agent: Agent, source: dict[str, Any], parts: Ini
     mean, std = (torch.cat([getattr(one, name) for one in normalizers]).double() for name in ("mean", "std"))
     before = source.get("observed_before")
     earlier = 0 if before is None else int(ObservationStatistics.from_json(before).count.max())
-    count = torch.full((spec.counts,), source["env_steps"] + earlier)
+    seen = (mean != 0.0) | (std != 1.0)  # else as a normaliser begins
+    count = (source["env_steps"] + earlier) * (seen if spec.counts > 1 else seen.any(0, keepdim=True))
     if parts != "all":
         count[spec.obs_dim :] = 0  # what critics alone read is new
     total, total_square = mean * count, (std.square() + mean.square()) * count

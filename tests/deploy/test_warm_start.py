@@ -3,6 +3,7 @@
 import dataclasses
 import io
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -140,6 +141,21 @@ def test_the_sums_behind_the_normaliser_are_of_the_sources_mean_and_deviation(
     mean, std = (theirs[f"normalizer.{name}"].double().numpy() for name in ("mean", "std"))
     np.testing.assert_allclose(observed.total / observed.count, mean, rtol=1e-9)
     np.testing.assert_allclose(observed.total_square / observed.count, std**2 + mean**2, rtol=1e-9)
+
+
+def test_a_number_that_the_source_never_saw_begins_anew(source: RunFolder, tmp_path: Path) -> None:
+    shutil.copytree(source.path, tmp_path / "source")
+    blind = RunFolder(tmp_path / "source")
+    learnt, checkpoints, file = state(blind), CheckpointFolder(blind.checkpoints), io.BytesIO()
+    learnt["agent"]["normalizer.mean"][1], learnt["agent"]["normalizer.std"][1] = 0.0, 1.0
+    torch.save(learnt, file)
+    newest = checkpoints.latest()
+    assert newest is not None
+    checkpoints.save(newest[0] + 1, {**newest[1], "learner.pt": file.getvalue()})
+    by_number = dataclasses.replace(OTHER, env=dataclasses.replace(ENV, drop_sensors=0.1))
+    first = CheckpointFolder(begin(by_number, tmp_path / "run", blind).checkpoints).latest()
+    assert first is not None
+    assert json.loads(first[1]["progress.json"])["observed_before"]["count"] == [1_200, 0, 1_200, 1_200]
 
 
 def test_the_normaliser_of_a_source_that_has_not_begun_is_its_own_sources(source: RunFolder, tmp_path: Path) -> None:
