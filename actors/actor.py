@@ -20,7 +20,7 @@ from rmc.actors.policy_runner import PolicyRunner
 from rmc.actors.unacked_entries import UnackedEntries
 from rmc.actors.window_builder import WindowBuilder
 from rmc.common.agent_config import AgentConfig
-from rmc.common.bus.protocol import TAKEN_OVER, UNTRAINED, Ack, Bus, Version
+from rmc.common.bus.protocol import TAKEN_OVER, UNTRAINED, Ack, Bus, Version, actor_role
 from rmc.common.env.wrappers import Env
 from rmc.common.errors import BusFull, BusUnavailable, FencedError, MessageError
 from rmc.common.metrics import Means, Rate
@@ -76,7 +76,7 @@ class Actor:
 
         Without a ``priority_fn`` windows enter the replay with the largest priority that is there.
         """
-        self.name = f"actor-{index}"
+        self.name = actor_role(index)
         self._index, self._seed, self._spec, self._config, self._hidden = index, seed, spec, config, agent.hidden
         self._bus, self._clock, self._priority_fn = bus, clock, priority_fn
         self._runner = PolicyRunner(spec.obs_dim, spec.action_dim, agent, config.envs_per_actor, spec.missing)

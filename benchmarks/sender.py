@@ -3,7 +3,7 @@
 import time
 
 from benchmarks.harness import random_rows
-from rmc.common.bus.protocol import Bus, EntryId
+from rmc.common.bus.protocol import Bus, EntryId, actor_role
 from rmc.common.window import WindowSpec
 from rmc.common.wire import MAX_ENTRY_BYTES, encode_hello, encode_windows
 
@@ -16,7 +16,7 @@ class Sender:
     def __init__(self, bus: Bus, spec: WindowSpec, actor: int = 0) -> None:
         self.bus, self.spec, self.chunk = bus, spec, min(CHUNK, max(1, MAX_ENTRY_BYTES // spec.dtype.itemsize))
         self._rows, self._actor = random_rows(spec, self.chunk), actor
-        self._epoch, self.seq, self._acknowledged = bus.take_epoch(f"actor-{actor}"), 0, 0
+        self._epoch, self.seq, self._acknowledged = bus.take_epoch(actor_role(actor)), 0, 0
         self.bus.append(actor, EntryId(self._epoch, 0), encode_hello(spec))
 
     def send(self, payload: bytes | None = None) -> None:

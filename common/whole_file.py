@@ -2,6 +2,7 @@
 
 import errno
 import os
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +15,24 @@ def write_whole(path: Path, content: bytes) -> None:
     temporary = temporary_path(path)
     write_synced(temporary, content)
     temporary.rename(path)
+
+
+def write_private(path: Path, content: bytes) -> None:
+    """As ``write_whole``, a file that only its owner may read, beside others who write it. Raises OSError."""
+    with private_temporary(path) as temporary:
+        write_synced(temporary, content)
+        temporary.rename(path)
+
+
+@contextmanager
+def private_temporary(path: Path) -> Iterator[Path]:
+    """A new file beside it that only its owner may read; after that it is removed, if it has this name still."""
+    handle, name = tempfile.mkstemp(prefix=f".{path.name}-", dir=path.parent)  # mode 0600
+    os.close(handle)
+    try:
+        yield Path(name)
+    finally:
+        Path(name).unlink(missing_ok=True)
 
 
 def temporary_path(path: Path) -> Path:

@@ -5,39 +5,21 @@ Importing this registers them; it takes the extra ``pybullet``. An observation o
 and speed of each joint in turn; contacts of the feet. As in the tables of the field, a contact is a position.
 """
 
-import ctypes
 import importlib
 import os
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from rmc.common.process.redirect import redirected
+
 ROBOTS = ("Ant", "HalfCheetah", "Hopper", "Walker2D")
 PARTS = ("positions", "velocities")
 Part = Literal["positions", "velocities"]
-
-
-@contextmanager
-def _no_output() -> Iterator[None]:
-    """pybullet's C code prints when it is loaded and when it connects, amid what a command prints as JSON."""
-    sys.stdout.flush()
-    sys.stderr.flush()
-    kept, nowhere = {number: os.dup(number) for number in (1, 2)}, os.open(os.devnull, os.O_WRONLY)
-    for number in kept:
-        os.dup2(nowhere, number)
-    try:
-        yield
-    finally:
-        ctypes.CDLL(None).fflush(None)  # or it is printed later
-        for number, copy in kept.items():
-            os.dup2(copy, number)
-            os.close(copy)
-        os.close(nowhere)
+# pybullet's C code prints when it is loaded and when it connects, amid what a command prints as JSON.
+NOWHERE = dict.fromkeys((1, 2), os.open(os.devnull, os.O_WRONLY))
 
 
 class ShownPart(gym.ObservationWrapper[Any, Any, Any]):
@@ -65,12 +47,12 @@ def make_walker(robot: str, part: Part, render_mode: str | None = None) -> Shown
     """One of ``ROBOTS``, without a time limit."""
     envs = importlib.import_module("pybullet_envs_gymnasium.gym_locomotion_envs")
     env = getattr(envs, f"{robot}BulletEnv")(render_mode=render_mode)
-    with _no_output():
+    with redirected(NOWHERE):
         env.reset(seed=0)  # connects; later resets go back to the state of this one
     return ShownPart(env, part)
 
 
-with _no_output():
+with redirected(NOWHERE):
     importlib.import_module("pybullet")
 for _robot in ROBOTS:
     for _part in PARTS:

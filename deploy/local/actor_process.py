@@ -9,7 +9,7 @@ import torch
 
 from rmc.actors.actor import Actor
 from rmc.actors.evaluator import Evaluator
-from rmc.common.bus.protocol import Bus
+from rmc.common.bus.protocol import Bus, actor_role
 from rmc.common.env.wrappers import Env
 from rmc.common.errors import ConfigError
 from rmc.common.process.role import run_role
@@ -30,7 +30,7 @@ def run_actor(connection: RunConnection, index: int) -> int:
         raise ConfigError("--index", index, f"the run has actors 0 to {config.actors - 1}")
     torch.set_num_threads(1)
     make_env = partial(process.make_env, config.agent.privileged_critic)
-    with process.starting(f"actor-{index}"):
+    with process.starting(actor_role(index)):
         actor = make_actor(config, index, make_env, process.bus)
     run_role(actor, process.bus, process.stop, idle_seconds=ACTOR_IDLE_SECONDS)
     return process.stop.exit_status

@@ -20,7 +20,7 @@ from rmc.deploy.monitor.monitor import Monitor
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
-from rmc.deploy.run.opening import open_run
+from rmc.deploy.run.opening import make, open_run
 from rmc.learner.config import MODEL_PROCESS
 
 TRAINED_SECONDS = 10.0  # of updates, which are measured
@@ -79,7 +79,10 @@ def run_trial(config: RunConfig, device: str, stop: StopSignal) -> Trial:
 
 @contextmanager
 def _folder(config: RunConfig, path: Path) -> Iterator[RunFolder]:
-    folder = open_run(config, LaunchOptions(path, "fail"))
+    begun = RunFolder(path)
+    make(begun)
+    begun.write_config(config)  # a run that goes on may have what a new one has no use for
+    folder = open_run(config, LaunchOptions(path))
     try:
         yield folder
     finally:

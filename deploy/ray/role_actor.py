@@ -15,7 +15,7 @@ import ray
 
 from rmc.common.errors import CONFIG_STATUS, CheckpointError
 from rmc.common.process import descendants
-from rmc.common.whole_file import NO_ROOM
+from rmc.common.whole_file import NO_ROOM, write_private
 from rmc.deploy.local.role_command import RoleCommand
 from rmc.deploy.local.supervisor import NO_PROCESS, RoleProcess
 from rmc.deploy.ray.node import leave_rays_worker, private_folder
@@ -104,7 +104,7 @@ class RoleActor:
         self.trouble = ""
         self.scratch = scratch_folder(task.scratch)
         for name, content in task.secrets.items():
-            _write_private(self.scratch / name, self._filled(content.decode()).encode())
+            write_private(self.scratch / name, self._filled(content.decode()).encode())
         self._status: int | None = None
         self.prepare()
         logs = self.log_folder()
@@ -218,14 +218,3 @@ class RoleActor:
             self._replaced = True
             self._end()
             self.flush_artifacts()
-
-
-def _write_private(path: Path, content: bytes) -> None:
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}-", dir=path.parent)  # a run's hosts begin together
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-        os.replace(temporary, path)
-    except OSError:  # the disk is full: nothing of it stays
-        os.unlink(temporary)
-        raise

@@ -19,6 +19,7 @@ import redis
 
 from rmc.common.errors import ConfigError
 from rmc.common.process import parent_death
+from rmc.common.whole_file import write_private
 from rmc.deploy.redis.users import LAUNCHER, RedisUsers
 from rmc.deploy.run import tls
 
@@ -127,17 +128,13 @@ class RedisServer:
             log.warning("the embedded Redis does not start (%s); trying again", error)
 
     def _write_users(self) -> None:
-        """In a file that only the owner may read."""
         assert self.users is not None
-        path = self.folder / "users.acl"
-        path.unlink(missing_ok=True)
-        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
-            file.write(self.users.acl())
+        write_private(self.folder / "users.acl", self.users.acl().encode())
 
     def admit(self, users: RedisUsers) -> None:
         """Take other users than before, of the same secret. A server that is away reads of them when it comes back."""
-        self.users, self._unread = users, False
-        self._write_users()  # a file that is cut must not be read
+        self.users = users
+        self._write_users()
         self._unread = True
         self._read_users()
 

@@ -15,6 +15,7 @@ from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 from rmc.actors.config import ActorConfig, EvaluatorConfig
 from rmc.common.agent_config import AgentConfig
 from rmc.common.bus.metrics_record import LARGEST
+from rmc.common.bus.protocol import actor_role
 from rmc.common.env.config import EnvConfig, check_kwargs, plain
 from rmc.common.env.layout import EnvLayout
 from rmc.common.env.make import env_layout
@@ -117,7 +118,7 @@ class RunConfig:
 
     def roles(self) -> tuple[str, ...]:
         """The names of all roles."""
-        actors = [f"actor-{index}" for index in range(self.actors)]
+        actors = [actor_role(index) for index in range(self.actors)]
         evaluator = ("evaluator",) if self.evaluator.episodes else ()
         return ("learner", *evaluator, *(shard.role for shard in self.shards()), *actors)
 

@@ -9,7 +9,6 @@ import logging
 import os
 import re
 import secrets
-import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import nullcontext, suppress
@@ -18,7 +17,7 @@ from typing import Any
 
 from rmc.common.bus.metrics_record import is_finite, is_metric, is_plain
 from rmc.common.errors import ConfigError
-from rmc.common.whole_file import NO_ROOM, write_whole
+from rmc.common.whole_file import NO_ROOM, private_temporary, write_synced, write_whole
 from rmc.deploy.run.config import RunConfig, from_json, to_json
 from rmc.deploy.run.env_sizes import check_sizes
 from rmc.deploy.run.migrations import migrated
@@ -203,29 +202,23 @@ class RunFolder:
 
     def _make_secret(self) -> None:
         """Whole or not at all; of two processes that do so at once, one is first, and both have its secret."""
-        handle, temporary = tempfile.mkstemp(prefix=f".{self.secret_file.name}-", dir=self.path)  # mode 0600
-        try:
-            with os.fdopen(handle, "w") as file:
-                file.write(secrets.token_hex(SECRET_LENGTH // 2) + "\n")
-                file.flush()
-                os.fsync(handle)
+        with private_temporary(self.secret_file) as temporary:
+            write_synced(temporary, f"{secrets.token_hex(SECRET_LENGTH // 2)}\n".encode())
             _link(temporary, self.secret_file)
-        finally:
-            Path(temporary).unlink(missing_ok=True)
 
     def writable(self) -> bool:
         """Whether files can be made in it."""
         return os.access(self.path, os.W_OK, effective_ids=os.access in os.supports_effective_ids)
 
 
-def _link(temporary: str, path: Path) -> None:
+def _link(temporary: Path, path: Path) -> None:
     """Give a file its name, if no other has that."""
     try:
         os.link(temporary, path)
     except FileExistsError:
         pass
     except OSError:  # a disk without hard links: who trains has locked the folder, and is the one who makes it
-        Path(temporary).rename(path)
+        temporary.rename(path)
 
 
 def read_object(path: Path, *numbers: str) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from itertools import count
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import ConfigError
@@ -18,6 +19,9 @@ from rmc.deploy.run.option_names import changes, option
 from rmc.deploy.run.starts import begun_with, format_begun, note_start
 from rmc.deploy.run.tracking import choose_tracking, keep_tracking
 from rmc.deploy.run.validation import validate_new
+
+if TYPE_CHECKING:  # imports torch
+    from rmc.deploy.run.warm_start import InitialCheckpoint
 
 SAME_AGENT = {  # what a run that goes on may have otherwise, and learns the same
     "total_steps",
@@ -81,19 +85,10 @@ def open_run(
     """
     folder = _named(options.run_dir or Path("runs") / default_name(config.env.id, config.preset, config.seed))
     there = options.goes_on
-    tracking, before, initial = choose_tracking(options), config, None
-    if there:
-        before = taken_up(folder, config, options)
-    else:
-        validate_new(config)
-        if options.init_from is not None:
-            from rmc.deploy.run import warm_start  # imports torch
-
-            initial = warm_start.prepare(config, options.init_from, options.init_parts)
+    tracking = choose_tracking(options)
+    before, initial = check_start(config, options)
     if options.run_dir is None or options.if_exists == "new":
         folder = new_folder(folder.path)
-    elif not there:
-        check_free(folder)
     make(folder)
     folder.lock.take()
     try:
@@ -113,6 +108,20 @@ def open_run(
         folder.lock.give_back()
         raise
     return folder
+
+
+def check_start(config: RunConfig, options: LaunchOptions) -> "tuple[RunConfig, InitialCheckpoint | None]":
+    """The config that the run had before, and what a new one begins with. Raises ConfigError; writes nothing."""
+    if options.run_dir is not None and options.goes_on:
+        return taken_up(_named(options.run_dir), config, options), None
+    validate_new(config)
+    if options.run_dir is not None and options.if_exists != "new":
+        check_free(_named(options.run_dir))
+    if options.init_from is None:
+        return config, None
+    from rmc.deploy.run import warm_start  # imports torch
+
+    return config, warm_start.prepare(config, options.init_from, options.init_parts)
 
 
 def _named(path: Path) -> RunFolder:

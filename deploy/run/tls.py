@@ -2,9 +2,10 @@
 
 import datetime
 import ipaddress
-import os
 import ssl
 from pathlib import Path
+
+from rmc.common.whole_file import write_private
 
 CERTIFICATE, KEY = "tls-cert.pem", "tls-key.pem"
 VALID = datetime.timedelta(days=3650)
@@ -36,9 +37,7 @@ def make_certificate(folder: Path, address: str = "127.0.0.1") -> None:
     plain = serialization.NoEncryption()
     private = key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, plain)
     for file, content in ((KEY, private), (CERTIFICATE, certificate.public_bytes(serialization.Encoding.PEM))):
-        handle = os.open(folder / file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
-        with os.fdopen(handle, "wb") as out:
-            out.write(content)
+        write_private(folder / file, content)
 
 
 def server_context(folder: Path) -> ssl.SSLContext:

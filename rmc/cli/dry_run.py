@@ -18,10 +18,10 @@ from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.host import this_machine
 from rmc.deploy.run.launch_options import LaunchOptions
-from rmc.deploy.run.opening import check_free, taken_up
+from rmc.deploy.run.opening import check_start
 from rmc.deploy.run.preflight import check_learner, check_port, ring_bytes_there
 from rmc.deploy.run.tracking import choose_tracking
-from rmc.deploy.run.validation import validate, validate_launch, validate_new
+from rmc.deploy.run.validation import validate, validate_launch
 
 FITS, NOT, SLOWER = "ok", "DOES NOT FIT", "slower"
 
@@ -29,12 +29,15 @@ FITS, NOT, SLOWER = "ok", "DOES NOT FIT", "slower"
 def dry_run(config: RunConfig, options: LaunchOptions, console: Console) -> int:
     """Try, measure, tell; 0 where it fits, else 1. Nothing is written in the run's folder. Raises ConfigError."""
     validate(config)
-    validate_new(config)
     validate_launch(config, options)
     if options.launcher != "local":
         raise ConfigError("--dry-run", True, f"a trial needs --launcher local, not {options.launcher}")
     check_learner(config, options.device)
-    _check_start(config, options)
+    check_port(options)
+    choose_tracking(options)
+    if options.redis_url is not None:
+        connect(options.redis_url, "check")
+    check_start(config, options)
     place_for_sockets()
     from rmc.analysis import evaluation  # imports torch
 
@@ -54,32 +57,10 @@ def dry_run(config: RunConfig, options: LaunchOptions, console: Console) -> int:
     return 1 if lacking else 0
 
 
-def _check_start(config: RunConfig, options: LaunchOptions) -> None:
-    """What a start asks beside the machine. Raises ConfigError."""
-    check_port(options)
-    choose_tracking(options)
-    if options.redis_url is not None:
-        connect(options.redis_url, "check")
-    if (folder := _there(options)) is not None:
-        taken_up(folder, config, options)
-        return
-    if options.run_dir is not None and options.if_exists != "new":
-        check_free(RunFolder(options.run_dir))
-    if options.init_from is not None:
-        from rmc.deploy.run import warm_start  # imports torch
-
-        warm_start.prepare(config, options.init_from, options.init_parts)
-
-
-def _there(options: LaunchOptions) -> RunFolder | None:
-    """The run that goes on."""
-    return RunFolder(options.run_dir) if options.run_dir is not None and options.goes_on else None
-
-
 def _there_already(config: RunConfig, options: LaunchOptions) -> There:
-    folder = _there(options)
-    if folder is None:
+    if options.run_dir is None or not options.goes_on:
         return There()
+    folder = RunFolder(options.run_dir)
     return There(ring_bytes_there(config, options), disk_bytes(folder.checkpoints), recorded_status(folder).env_steps)
 
 

@@ -2,10 +2,8 @@
 
 import dataclasses
 import json
-import os
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +21,7 @@ from rmc.cli.ending import cut_note, episode_count
 from rmc.cli.signals import signals_caught
 from rmc.common.env.config import RANGES, check_range
 from rmc.common.errors import ConfigError
+from rmc.common.process.redirect import redirected
 from rmc.common.whole_file import write_whole
 from rmc.deploy.monitor.view import terminal
 
@@ -35,7 +34,7 @@ def evaluate(command: run_options.Evaluate) -> int:
         check_range("--flicker", flicker, (0.0, 1.0))
     if command.env_timeout is not None:
         check_range("--env-timeout", command.env_timeout, RANGES["env_timeout"])
-    aside = _said_aside if command.json else nullcontext
+    aside = partial(redirected, {1: 2}) if command.json else nullcontext  # what a user's module prints
     with aside():
         policy = _policy(command)
         if policy is not None and command.video is not None:
@@ -52,20 +51,6 @@ def evaluate(command: run_options.Evaluate) -> int:
         with aside():
             _film(command, policy, command.video)
     return 0
-
-
-@contextmanager
-def _said_aside() -> Iterator[None]:
-    """What a user's module prints goes to standard error."""
-    sys.stdout.flush()
-    kept = os.dup(1)
-    os.dup2(2, 1)
-    try:
-        yield
-    finally:
-        sys.stdout.flush()
-        os.dup2(kept, 1)
-        os.close(kept)
 
 
 def _policy(command: run_options.Evaluate) -> PolicyFile | None:

@@ -14,10 +14,11 @@ from rmc.common.bus.redis_url import value_without_passwords, without_passwords
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.launch_options import LaunchOptions
+from rmc.deploy.run.opening import check_start
 from rmc.deploy.run.option_names import flat, option, option_words
 from rmc.deploy.run.preflight import check_machine
 from rmc.deploy.run.tracking import choose_tracking
-from rmc.deploy.run.validation import validate, validate_launch, validate_new
+from rmc.deploy.run.validation import validate, validate_launch
 from rmc.sweep.job import Job
 from rmc.sweep.spec import EVERY_RUNS, Range, Spec, check_name
 
@@ -133,8 +134,6 @@ def _checked(job: Job, on_this_machine: bool) -> Checked:
     command = parser.parse(list(job.words))
     config, options = command.config(), dataclasses.replace(command.launch_options(), run_dir=job.folder)
     validate(config)
-    if not options.goes_on:
-        validate_new(config)
     validate_launch(config, options)
     if on_this_machine:
         check_machine(config, options)
@@ -143,10 +142,8 @@ def _checked(job: Job, on_this_machine: bool) -> Checked:
         if options.device not in ("cpu", "cuda", "cuda:0"):
             raise ConfigError("--device", options.device, "a run on a node sees one GPU; take cuda")
         config.sizes()  # the environment's, which the nodes make, too
-    if options.init_from is not None and not (job.folder / "config.json").exists():
-        from rmc.deploy.run import warm_start  # imports torch
-
-        warm_start.prepare(config, options.init_from, options.init_parts)
+    if not options.goes_on:  # is_finished judges the others; a run whose folder has something else fails alone
+        check_start(config, dataclasses.replace(options, run_dir=None))
     return Checked(job, config, options)
 
 

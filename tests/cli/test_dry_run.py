@@ -18,6 +18,8 @@ from rmc.cli import dry_run as cli_dry_run
 from rmc.cli import main
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
+from rmc.common.process.role import StopSignal
+from rmc.deploy.local import trial
 from rmc.deploy.local.trial import RoleUse, Trial, trial_config
 from rmc.deploy.monitor.figures import duration
 from rmc.deploy.run.host import Machine, this_machine
@@ -25,7 +27,9 @@ from rmc.deploy.run.preflight import ring_bytes
 from rmc.deploy.run.presets import debug, robust
 from rmc.replay_server.ring import file_bytes
 from tests.command import COMMAND, rmc
+from tests.deploy.test_config import with_value
 from tests.integration.running import Training
+from tests.runs import untrained
 from tests.waiting import wait_until
 
 CONFIG = debug(EnvConfig("InvertedPendulum-v5"))
@@ -44,6 +48,9 @@ def records() -> list[dict[str, Any]]:
         of_learner = {"updates": 8 * second, "threads": 3, "busy_share": 1.0, "waiting_share": 0.0}
         messages.append({"role": "learner", "time": 100.5 + second} | of_learner)
     return messages
+
+
+MEASURED = Trial({"learner": RoleUse(300 << 20, 20, 4)}, records(), 2_000_000, 1_000.0)
 
 
 def rows(config=CONFIG, machine: Machine = MACHINE, **uses: RoleUse) -> dict[str, Need]:
@@ -106,9 +113,9 @@ def test_a_short_run_keeps_no_more_checkpoints_than_it_makes() -> None:
 
 
 def test_a_run_that_goes_on_needs_what_is_to_come() -> None:
-    trial, ring = Trial({"learner": RoleUse(1, 1, 1)}, records(), 1_000_000, 0.0), ring_bytes(CONFIG)
+    tried, ring = Trial({"learner": RoleUse(1, 1, 1)}, records(), 1_000_000, 0.0), ring_bytes(CONFIG)
     before, after = (
-        {row.what: row.needs for row in needs(CONFIG, trial, MACHINE, there)}
+        {row.what: row.needs for row in needs(CONFIG, tried, MACHINE, there)}
         for there in (There(), There(ring, 3_000_000, 1_000))
     )
     assert (before["disk, ring"], after["disk, ring"]) == (size_text(ring), size_text(0))
@@ -177,9 +184,8 @@ def test_estimates_are_what_a_real_run_takes(tmp_path: Path) -> None:
 def test_a_ring_that_is_too_large_is_marked_and_the_status_is_1(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """As trials, those of docs/memory.md and docs/doctor.md are real."""
-    measured = Trial({"learner": RoleUse(300 << 20, 20, 4)}, records(), 2_000_000, 1_000.0)
-    monkeypatch.setattr(cli_dry_run, "run_trial", lambda config, device, stop: measured)
+    """That of docs/doctor.md is real."""
+    monkeypatch.setattr(cli_dry_run, "run_trial", lambda config, device, stop: MEASURED)
     words = [*TRAIN, "--dry-run", "--run-dir", str(tmp_path / "run"), "--capacity", "1000000000000"]
     assert main.run(words) == 1
     output, errors = capsys.readouterr()
@@ -187,6 +193,19 @@ def test_a_ring_that_is_too_large_is_marked_and_the_status_is_1(
     assert re.search(r"^memory, all .* DOES NOT FIT$", output, re.MULTILINE)
     assert output.splitlines()[-1] == "does not fit: memory, all, disk, all"
     assert not (tmp_path / "run").exists()
+
+
+def test_a_run_that_goes_on_is_tried_with_what_a_new_one_has_no_use_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(cli_dry_run, "run_trial", lambda config, device, stop: MEASURED)
+    folder = untrained(tmp_path / "run", CONFIG)
+    folder.write_config(with_value(CONFIG, "env.flicker_burst", 5.0))
+    assert main.run(["resume", str(folder.path), "--dry-run"]) == 0
+    output, errors = capsys.readouterr()
+    assert (errors, output.splitlines()[-1]) == ("", "it fits")
+    monkeypatch.setattr(trial, "_train", lambda *_: MEASURED.roles)
+    assert trial.run_trial(folder.config(), "cpu", StopSignal()).roles == MEASURED.roles
 
 
 def test_a_folder_of_something_else_is_refused_as_a_start_would(

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 import redis
 
+from rmc.common import whole_file
 from rmc.common.bus.protocol import Ack, EntryId, ReplayOwner, Version
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.errors import BusUnavailable, ConfigError
@@ -226,17 +227,17 @@ def test_users_that_come_while_the_server_stands_still_get_in_later(tmp_path: Pa
         late.redis.close()
 
 
-def test_a_file_of_users_that_is_cut_is_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(server: RedisServer) -> None:
-        (server.folder / "users.acl").write_text("")
+def test_where_there_is_no_room_for_other_users_those_before_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(path: Path, _: bytes) -> None:
+        path.write_bytes(b"")
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with tempfile.TemporaryDirectory(prefix="rmc-users-") as folder, RedisServer(Path(folder), users=USERS) as server:
         with monkeypatch.context() as patch:
-            patch.setattr(RedisServer, "_write_users", full)
+            patch.setattr(whole_file, "write_synced", full)
             with pytest.raises(OSError, match="No space"):
                 server.admit(RedisUsers(USERS.run, SECRET, (*USERS.roles, "actor-2")))
-        server.tend()
+        server._read_users()
         there = bus_of(server, "actor-1")
         there.ping()
         there.redis.close()
