@@ -22,11 +22,9 @@ def interquartile_mean(scores: Scores) -> float:
     return float(ordered[cut : len(ordered) - cut].mean())
 
 
-def interval(
-    statistic: Callable[[Scores], float], scores: Scores, seed: int = 0, resamples: int = RESAMPLES
-) -> tuple[float, float]:
+def interval(statistic: Callable[[Scores], float], scores: Scores, resamples: int = RESAMPLES) -> tuple[float, float]:
     """Percentile bootstrap of a statistic of (R, E) scores, runs drawn anew within each environment."""
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(0)
     estimates = [statistic(_resampled(scores, random)) for _ in range(resamples)]
     low, high = np.quantile(estimates, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
     return float(low), float(high)

@@ -69,10 +69,9 @@ def replay_of(run: RunConfig) -> Iterator[RedisBus]:
 
 @contextmanager
 def learner_role(run: RunConfig, bus: RedisBus, batch_size: int, precision: Precision) -> Iterator[Learner]:
-    spec, address = run.window_spec(), bus.replay_address("replay")
-    assert address is not None
+    spec = run.window_spec()
     config = dataclasses.replace(run.learner, batch_size=batch_size, checkpoint_steps=ENDLESS, precision=precision)
-    client = ReplayClient(lambda: address.address, SECRET, spec, batch_size)
+    client = ReplayClient(lambda: bus.replay_address("replay"), SECRET, spec, batch_size)
     with tempfile.TemporaryDirectory() as at:
         role = Learner(spec, run.agent, run.update, config, client, bus, CheckpointFolder(Path(at)), 0)
         yield role

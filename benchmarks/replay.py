@@ -75,10 +75,8 @@ class Learner:
     """The learner's side of ours: all that happens to a batch but the update."""
 
     def __init__(self, bus: RedisBus, spec: WindowSpec) -> None:
-        address = bus.replay_address("replay")
-        assert address is not None
         self.spec, self.env_steps, self.batch = spec, 0, None
-        self.client = ReplayClient(lambda: address.address, SECRET, spec, BATCH)
+        self.client = ReplayClient(lambda: bus.replay_address("replay"), SECRET, spec, BATCH)
         self._random, self._exponent = np.random.default_rng(0), LearnerConfig().importance_exponent
 
     def step(self) -> int:

@@ -139,6 +139,8 @@ class ReplayConnection:
 
 
 def _connect(address: str, tls: ssl.SSLContext | None) -> socket.socket:
+    if "\0" in address:  # a socket would raise TypeError
+        raise ValueError(f"{address!r:.200} is no address")
     scheme, _, rest = address.partition(":")
     host, _, port = rest.rpartition(":")
     target: Any = rest if scheme == "unix" else (host, int(port))

@@ -10,7 +10,6 @@ from rmc.common.bus.protocol import (
     Ack,
     Entry,
     EntryId,
-    ReplayAddress,
     ReplayOwner,
     Version,
     actor_role,
@@ -26,7 +25,7 @@ class MemoryBus:
         self._streams: dict[int, dict[EntryId, bytes]] = {}
         self._last_ids: dict[int, EntryId] = {}
         self._acks: dict[int, Ack] = {}
-        self._replay: dict[str, ReplayAddress] = {}
+        self._replay: dict[str, str] = {}
         self._progress: dict[str, bytes] = {}
         self._weights: dict[bool, tuple[Version, bytes]] = {}
         self._records: dict[str, list[dict[str, Any]]] = {}
@@ -102,9 +101,9 @@ class MemoryBus:
         self.dead_letters.append((entry, reason))
 
     def announce_replay(self, owner: ReplayOwner, address: str) -> None:
-        self._replay[owner.role] = ReplayAddress(owner.epoch, address)
+        self._replay[owner.role] = address
 
-    def replay_address(self, role: str) -> ReplayAddress | None:
+    def replay_address(self, role: str) -> str | None:
         return self._replay.get(role)
 
     def publish_weights(self, version: Version, blob: bytes, evaluate: bool = False) -> None:

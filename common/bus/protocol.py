@@ -10,7 +10,7 @@ Every Redis key, R = ``rmc:{run}``:
 | R:windows:ACTOR         | stream | actor    | entries ``epoch-seq``, field ``p`` = a wire entry        |
 | R:acks                  | hash   | replay   | ACTOR -> ``epoch seq granted_steps final``               |
 | R:progress              | hash   | replay   | ROLE of a shard -> its newest commit's counters          |
-| R:replay                | hash   | replay   | ROLE of a shard -> ``epoch address`` of its socket       |
+| R:replay                | hash   | replay   | ROLE of a shard -> where it listens                      |
 | R:weights               | string | learner  | ``epoch update pieces crc32`` of the newest weights      |
 | R:weights:EPOCH:UPDATE:I| string | learner  | piece I (256 KiB) of a policy, safetensors               |
 | R:evaluate              | string | learner  | ``epoch update pieces crc32`` the evaluator should play  |
@@ -22,7 +22,6 @@ Every Redis key, R = ``rmc:{run}``:
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 MAX_EPOCH_GAP = 1 << 16  # epochs that a role can take at most beyond the last one that is known of it
@@ -76,14 +75,6 @@ class ReplayOwner(NamedTuple):
 
     role: str
     epoch: int
-
-
-@dataclass(frozen=True)
-class ReplayAddress:
-    """Where a replay server listens: ``unix:PATH`` or ``tcp:HOST:PORT``."""
-
-    epoch: int
-    address: str
 
 
 class Bus(Protocol):
@@ -141,9 +132,9 @@ class Bus(Protocol):
         """Put a refused entry aside."""
 
     def announce_replay(self, owner: ReplayOwner, address: str) -> None:
-        """Say where a replay server listens."""
+        """Say where a replay server listens: ``unix:PATH`` or ``tcp:HOST:PORT``."""
 
-    def replay_address(self, role: str) -> ReplayAddress | None:
+    def replay_address(self, role: str) -> str | None:
         """Where that replay server listens, once it does."""
 
     def publish_weights(self, version: Version, blob: bytes, evaluate: bool = False) -> None:

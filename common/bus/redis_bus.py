@@ -12,7 +12,6 @@ from rmc.common.bus.protocol import (
     Ack,
     Entry,
     EntryId,
-    ReplayAddress,
     ReplayOwner,
     actor_role,
 )
@@ -200,13 +199,11 @@ class RedisBus(WeightStore):
         self.call(lambda: self.redis.xadd(self.key("dead"), fields, maxlen=DEAD_LETTERS_KEPT))
 
     def announce_replay(self, owner: ReplayOwner, address: str) -> None:
-        self.call(lambda: self.redis.hset(self.key("replay"), owner.role, f"{owner.epoch} {address}"))
+        self.call(lambda: self.redis.hset(self.key("replay"), owner.role, address))
 
-    def replay_address(self, role: str) -> ReplayAddress | None:
+    def replay_address(self, role: str) -> str | None:
         raw = self.call(lambda: self.redis.hget(self.key("replay"), role))
-        epoch, _, address = (raw or b"").partition(b" ")
-        numbers = self.integers(epoch, 1)
-        return ReplayAddress(numbers[0], address.decode(errors="replace")) if numbers else None
+        return raw.decode(errors="replace") if raw else None
 
     def emit(self, role: str, record: Mapping[str, Any]) -> None:
         key, fields = self.key("metrics", role), {"r": encode_record(record)}

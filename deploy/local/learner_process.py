@@ -1,8 +1,9 @@
 """The learner's process."""
 
 import ssl
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -62,14 +63,6 @@ def replay_clients(
     config: RunConfig, bus: RedisBus, secret: bytes, pinned: bool, context: ssl.SSLContext | None
 ) -> list[ReplayClient]:
     """A client of each replay server. What one draws is its part of a batch, where there are several."""
-
-    def address_of(role: str) -> Callable[[], str | None]:
-        def address() -> str | None:
-            location = bus.replay_address(role)
-            return location.address if location else None
-
-        return address
-
     spec, part = config.window_spec(), max(1, config.learner.batch_size // config.replay.replay_shards)
-    addresses = [address_of(shard.role) for shard in config.shards()]
+    addresses = [partial(bus.replay_address, shard.role) for shard in config.shards()]
     return [ReplayClient(address, secret, spec, part, pinned, context) for address in addresses]

@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from rmc.common.bus.protocol import actor_role
 from rmc.common.shard import Shard
 from rmc.deploy.run.config import RunConfig
-from rmc.deploy.run.launch_options import LaunchOptions
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class RoleCommand:
 def actor_commands(config: RunConfig, run: str) -> list[RoleCommand]:
     """One for every actor of the ``run``."""
     return [
-        _playing(config, f"actor-{index}", "actor", f"--run={run}", "--index", str(index))
+        _playing(config, actor_role(index), "actor", f"--run={run}", "--index", str(index))
         for index in range(config.actors)
     ]
 
@@ -49,10 +49,7 @@ def replay_command(shard: Shard, run: str, folder: str, listen: str, secrets: Se
     return RoleCommand(shard.role, ("role", "replay", *words), forked=False)
 
 
-def launcher_command(folder: str, ray_address: str, options: LaunchOptions) -> RoleCommand:
-    """That of a run's launcher on a Ray cluster's head."""
-    words = [folder, "--ray-address", ray_address, "--device", options.device]
-    words += ["--all-cpus"] * options.all_cpus + ["--tls"] * options.tls
-    if options.metrics_port is not None:
-        words += ["--metrics-port", str(options.metrics_port), "--metrics-host", options.metrics_host]
-    return RoleCommand("launcher", ("role", "launcher", *words), single_thread=False, ends=True)
+def launcher_command(folder: str, ray_address: str) -> RoleCommand:
+    """That of a run's launcher on a Ray cluster's head; its other options are those of the run's newest start."""
+    words = ("role", "launcher", folder, "--ray-address", ray_address)
+    return RoleCommand("launcher", words, single_thread=False, ends=True)

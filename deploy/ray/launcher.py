@@ -28,7 +28,7 @@ from rmc.deploy.ray.role_actor import NAMESPACE, Task, actor_name
 from rmc.deploy.run import tls
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
-from rmc.deploy.run.launch_options import LaunchOptions, users_path
+from rmc.deploy.run.launch_options import users_path
 
 BEGIN_SECONDS = 60.0  # of the launcher's host
 CLOSE_SECONDS, LOOK_SECONDS = 10.0, 0.2  # for it to end, and between looks
@@ -74,10 +74,10 @@ def check_on_head() -> None:
         )
 
 
-def launch(config: RunConfig, folder: RunFolder, options: LaunchOptions) -> None:
+def launch(config: RunConfig, folder: RunFolder) -> None:
     """Start the launcher of a locked run on this node, which must be the head; unlocks it. Raises ConfigError."""
     try:
-        host = _created(config, folder, options)
+        host = _created(config, folder)
     finally:
         folder.lock.release()  # for the launcher: another start finds the actor's name
     try:
@@ -90,11 +90,11 @@ def launch(config: RunConfig, folder: RunFolder, options: LaunchOptions) -> None
         raise ConfigError("--launcher", "ray", fix) from None
 
 
-def _created(config: RunConfig, folder: RunFolder, options: LaunchOptions) -> Any:
+def _created(config: RunConfig, folder: RunFolder) -> Any:
     context = ray.get_runtime_context()
     for file in (tls.CERTIFICATE, tls.KEY):  # for the address that the head has now
         (folder.path / file).unlink(missing_ok=True)
-    command = launcher_command(str(folder.path), context.gcs_address, options)
+    command = launcher_command(str(folder.path), context.gcs_address)
     actor = ray.remote(LauncherActor).options(
         name=actor_name(folder.name, "launcher"), namespace=NAMESPACE, lifetime="detached", max_restarts=-1, num_cpus=0,
         scheduling_strategy=NodeAffinitySchedulingStrategy(context.get_node_id(), soft=False),

@@ -214,7 +214,7 @@ def taken_up(folder: RunFolder, config: RunConfig, options: LaunchOptions) -> Ru
     folder.check_sizes(config.env.id, config.sizes())
     check_checkpoints(folder)
     _check_begun(folder, options)
-    folder.result()  # raises where it is damaged, before anything is written
+    _check_unfinished(folder, before, config)
     return before
 
 
@@ -228,6 +228,17 @@ def _check_changes(folder: RunFolder, before: RunConfig, config: RunConfig) -> N
             was, now = changed[path]
             fix = f"the run in {folder.path} has {was!r}, and {why}; use that, or another --run-dir"
             raise ConfigError(name, now, fix)
+
+
+def _check_unfinished(folder: RunFolder, before: RunConfig, config: RunConfig) -> None:
+    """Raises ConfigError for the first change that would wait for steps that nobody asks for."""
+    result = folder.result()
+    if result is None or result["env_steps"] < config.total_steps:
+        return
+    for path, (_, now) in changes(before, config).items():
+        if not path.startswith("evaluator."):  # of a last evaluation that is played again
+            fix = f"all {result['env_steps']:,} steps are trained; leave it, or take more --total-steps"
+            raise ConfigError(option(path), now, fix)
 
 
 def _check_begun(folder: RunFolder, options: LaunchOptions) -> None:

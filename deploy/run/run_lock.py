@@ -31,6 +31,7 @@ class RunLock:
 
     def take(self) -> None:
         """Be the one launcher of this run. Raises ConfigError where another one is."""
+        self.check_untrained()
         self._handle = take_lock(self._file, LOCK_SECONDS)
         if self._handle is None:
             raise self._is_trained()
@@ -83,7 +84,7 @@ class RunLock:
             raise self._is_trained()
 
     def _is_trained(self) -> ConfigError:
-        return ConfigError("--run-dir", str(self._folder), "this run is being trained; stop it first")
+        return ConfigError("--run-dir", str(self._folder), "this run is being trained; stop it first, or watch it: rmc attach")
 
     def trainer(self) -> int | None:
         """The process of the launcher that trains this run now, if one does, wherever that is."""

@@ -54,7 +54,7 @@ def _watched(
     place_for_sockets()
     folder = open_run(config, options, launcher.check_not_there)
     with signals_caught(hangup=options.ray_address == "local") as stop:  # only a cluster of our own ends with us
-        launcher.launch(config, folder, options)
+        launcher.launch(config, folder)
         console.print(f"run folder {folder.path}", soft_wrap=True)
         if note := reach_note(config):
             console.print(note, soft_wrap=True)

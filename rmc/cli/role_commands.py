@@ -12,7 +12,7 @@ from rmc.deploy.local.role_environment import SECRET_VARIABLE, URL_VARIABLE
 from rmc.deploy.local.role_process import RunConnection
 from rmc.deploy.monitor.view import terminal
 from rmc.deploy.run.folder import RunFolder
-from rmc.deploy.run.launch_options import LaunchOptions
+from rmc.deploy.run.starts import last_launch
 
 
 def run_role(command: Role) -> int:
@@ -51,7 +51,6 @@ def launch(command: LauncherRole) -> int:
     signals.interrupt()  # SIGTERM ends it cleanly while no role is there yet, too
     folder = RunFolder(command.run)
     config = folder.config()
-    named = {item.name: getattr(command, item.name) for item in dataclasses.fields(command) if item.name != "run"}
-    launch_options = LaunchOptions(folder.path, launcher="ray", **named)
+    launch_options = dataclasses.replace(last_launch(folder, "ray"), ray_address=command.ray_address)
     folder.lock.take()
     return training.conduct(config, folder, launch_options, terminal(400))

@@ -16,16 +16,6 @@ class LauncherRole:
     """The run's folder."""
     ray_address: str = "auto"
     """The cluster."""
-    device: str = "cpu"
-    """The learner's device."""
-    all_cpus: bool = False
-    """An actor for every CPU left."""
-    tls: bool = False
-    """Encrypt what the roles say across machines."""
-    metrics_port: int | None = None
-    """Serve the run's metrics to Prometheus on this port."""
-    metrics_host: str = "127.0.0.1"
-    """Where that port listens."""
 
 
 @dataclass(frozen=True)

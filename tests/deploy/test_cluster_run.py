@@ -24,7 +24,6 @@ from rmc.deploy.ray.placement import RolePlacement
 from rmc.deploy.ray.role_actor import RoleActor
 from rmc.deploy.ray.run import ClusterRun
 from rmc.deploy.run.folder import RunFolder
-from rmc.deploy.run.launch_options import LaunchOptions
 from tests.runs import untrained
 
 
@@ -189,7 +188,7 @@ def test_a_second_start_is_told_that_the_run_is_trained(folder: RunFolder, monke
     monkeypatch.setattr(ray_launcher.ray, "remote", lambda _: options)
     folder.lock.take()
     with pytest.raises(ConfigError, match=r"^--run-dir=.*: this run is being trained; rmc attach watches it$"):
-        ray_launcher.launch(folder.config(), folder, LaunchOptions(folder.path, launcher="ray"))
+        ray_launcher.launch(folder.config(), folder)
     assert (held, folder.lock.trainer()) == ([True], None)
 
 

@@ -1,5 +1,6 @@
 """What Prometheus is shown, to how many at once, and when its alerts fire; tests/integration has a real scrape."""
 
+import dataclasses
 import json
 import math
 import re
@@ -16,13 +17,13 @@ import pytest
 import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
-from rmc.cli import main, parser
-from rmc.cli.role_options import LauncherRole
+from rmc.cli import main, role_commands
 from rmc.deploy.local.role_command import launcher_command
 from rmc.deploy.monitor import exporter
 from rmc.deploy.monitor.run_status import RunStatus
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
+from rmc.deploy.run.starts import note_start
 from tests.integration.running import free_port
 
 ROOT = Path(__file__).parents[2]
@@ -159,7 +160,7 @@ def test_a_second_start_is_not_told_of_the_port_that_the_first_one_has(
         words = ["resume", str(folder.path), "--metrics-port", str(port)]
         assert main.run(words) == 2
         folder.lock.release()
-    assert capsys.readouterr().err == f"rmc: --run-dir='{folder.path}': this run is being trained; stop it first\n"
+    assert capsys.readouterr().err == f"rmc: --run-dir='{folder.path}': this run is being trained; stop it first, or watch it: rmc attach\n"
 
 
 def test_nobodys_name_is_looked_up(status: RunStatus, port: int, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -169,10 +170,27 @@ def test_nobodys_name_is_looked_up(status: RunStatus, port: int, monkeypatch: py
         assert "rmc_" in scraped(port)
 
 
-@pytest.mark.parametrize("options", [{}, {"metrics_port": 9464, "metrics_host": "0.0.0.0", "tls": True}])
-def test_a_launcher_on_ray_is_told(options: dict[str, Any]) -> None:
-    command = parser.parse(list(launcher_command("run", "head:1", LaunchOptions(None, **options)).words))
-    assert command.role == LauncherRole(Path("run"), "head:1", **options)
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"device": "cuda", "all_cpus": True, "tls": True, "metrics_port": 9464, "metrics_host": "0.0.0.0"}],
+)
+def test_a_launcher_on_ray_has_the_options_of_the_newest_start(
+    folder: RunFolder, options: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    had: list[LaunchOptions] = []
+
+    def conduct(_: object, folder: RunFolder, options: LaunchOptions, *__: object) -> int:
+        had.append(options)
+        folder.lock.release()
+        return 0
+
+    monkeypatch.setattr(role_commands.training, "conduct", conduct)
+    monkeypatch.setattr(role_commands.signals, "interrupt", lambda: None)
+    started = LaunchOptions(folder.path, launcher="ray", **options)
+    note_start(folder, {}, dataclasses.replace(started, device="cpu", metrics_port=1), None)
+    note_start(folder, {}, started, None)
+    assert main.run(list(launcher_command(str(folder.path), "head:1").words)) == 0
+    assert had == [dataclasses.replace(started, ray_address="head:1")]
 
 
 @promtool

@@ -12,7 +12,7 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.run import metrics_tail, opening
 from rmc.deploy.run.config import RunConfig
-from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.folder import RESULT, RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.opening import MAY_CHANGE, open_run
 from rmc.deploy.run.option_names import flat
@@ -22,6 +22,7 @@ from rmc.deploy.run.state import run_state
 from tests.deploy.test_config import with_value
 
 CONFIG = debug(EnvConfig("InvertedPendulum-v5"))
+FINISHED = dict.fromkeys(RESULT, 4_000) | {"eval_cut": 0.0}
 
 
 def another(path: str, value: Any) -> Any:
@@ -58,6 +59,21 @@ def test_every_option_may_change_or_is_refused_with_the_reason(path: str, folder
         assert repr(flat(changed)[path]) in str(no.value)
         assert folder.config() == CONFIG
         assert len(starts(folder)) == 1
+
+
+@pytest.mark.parametrize(("path", "value"), [("total_steps", 3_000), ("actors", 3), ("evaluator.episodes", 3)])
+def test_nothing_changes_in_a_run_that_has_no_step_to_train(path: str, value: int, folder: RunFolder) -> None:
+    changed = with_value(CONFIG, path, value)
+    folder.write_result(FINISHED)
+    if path.startswith("evaluator."):  # its last evaluation may have been cut
+        open_run(changed, LaunchOptions(folder.path)).lock.release()
+        assert folder.config() == changed
+        return
+    with pytest.raises(ConfigError, match=f"--.*={value}: all 4,000 steps are trained; leave it, or take more --total"):
+        open_run(changed, LaunchOptions(folder.path))
+    assert (folder.config(), folder.result(), len(starts(folder))) == (CONFIG, FINISHED, 1)
+    open_run(dataclasses.replace(changed, total_steps=9_000), LaunchOptions(folder.path)).lock.release()
+    assert folder.result() is None
 
 
 def test_a_run_goes_on_from_an_older_checkpoint_and_is_refused_where_none_is_whole(folder: RunFolder) -> None:

@@ -45,9 +45,7 @@ class Running:
 
 
 def client_of(bus: RedisBus, epoch: int = 0) -> ReplayClient:
-    address = bus.replay_address("replay")
-    assert address is not None
-    client = ReplayClient(lambda: address.address, SECRET, SPEC, 16)
+    client = ReplayClient(lambda: bus.replay_address("replay"), SECRET, SPEC, 16)
     client.register_learner(epoch)
     return client
 

@@ -266,7 +266,10 @@ def away_for(served: Served, sample: Sample, reason: str, caplog: pytest.LogCapt
     client.close()
 
 
-@pytest.mark.parametrize("address", ["tcp:127.0.0.1:no", "tcp:127.0.0.1:99999", "unix:a\0b", "tcp:" + "x" * 99 + ":1"])
+@pytest.mark.parametrize(
+    "address",
+    ["tcp:127.0.0.1:no", "tcp:127.0.0.1:99999", "unix:a\0b", "tcp:a\0b:1", "tcp:" + "x" * 99 + ":1", "3 unix:/a"],
+)
 def test_an_address_that_is_none_is_an_outage(address: str) -> None:
     client = ReplayClient(lambda: address, SECRET, SPEC, 8)
     assert client.sample(8).status is SampleStatus.WAIT
