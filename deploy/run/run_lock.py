@@ -84,7 +84,8 @@ class RunLock:
             raise self._is_trained()
 
     def _is_trained(self) -> ConfigError:
-        return ConfigError("--run-dir", str(self._folder), "this run is being trained; stop it first, or watch it: rmc attach")
+        fix = "this run is being trained; stop it first, or watch it: rmc attach"
+        return ConfigError("--run-dir", str(self._folder), fix)
 
     def trainer(self) -> int | None:
         """The process of the launcher that trains this run now, if one does, wherever that is."""
