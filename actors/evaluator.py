@@ -86,6 +86,7 @@ class Rollout:
         self.broken = self.steps = 0
         self.fault: Exception | None = None  # what an environment broke in last
         self.cut = False
+        self.keeps = self.stopped = False  # whether an interrupt ends it as ``seconds`` do, and did
         self._prev_action, self._state = runner.start()
         self._length = -1  # of the episode; it has not begun
 
@@ -150,12 +151,17 @@ def play_episodes(
 ) -> Rollout:
     """So many deterministic episodes, as a ``Rollout``, which ``watch`` sees after each step.
 
-    Those in which the environment broke are left out. Raises EnvFault where none is left.
+    Those in which the environment broke are left out. Raises EnvFault where none is left, KeyboardInterrupt where
+    it is interrupted and does not keep what is over, or nothing is.
     """
     rollout = Rollout(runner, make_env(), make_env, episodes, seed, seconds)
     try:
         while rollout.step():
             watch(rollout)
+    except KeyboardInterrupt:
+        if not (rollout.keeps and rollout.returns):
+            raise
+        rollout.stopped = rollout.cut = True
     finally:
         rollout.env.close()
     if not rollout.returns:

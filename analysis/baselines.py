@@ -26,6 +26,7 @@ from rmc.analysis.evaluation import FINAL_EPISODES, EvaluationProgress, Watch, m
 from rmc.common.env.make import env_layout, make_env
 from rmc.common.errors import STOPPED_STATUS, ConfigError
 from rmc.common.process.role import StopSignal
+from rmc.common.return_text import return_text
 from rmc.common.whole_file import write_whole
 from rmc.deploy.monitor import main_metrics
 from rmc.deploy.monitor.metrics_log import MetricsLog
@@ -80,8 +81,8 @@ def _conduct(
         console.print(f"  {resume_command(folder)}", soft_wrap=True)
         return STOPPED_STATUS
     folder.write_result(result)
-    mean, deviation = result["eval_return_mean"], result["eval_return_std"]
-    console.print(f"after training: return {mean:,.1f} ± {deviation:,.1f}; {folder.result_file}")
+    returns = return_text(result["eval_return_mean"], result["eval_return_std"])
+    console.print(f"after training: return {returns}; {folder.result_file}")
     return 0
 
 
@@ -207,9 +208,8 @@ class _Run(BaseCallback):
         result = self._play(self.config.episodes, final=False)
         self._write_progress()
         self._write("evaluator", {**result, "eval_update": self._model.updates, "eval_env_steps": self.steps})
-        mean, deviation = result["eval_return_mean"], result["eval_return_std"]
-        line = f"step {self.steps:,}: return {mean:,.1f} ± {deviation:,.1f}, {self._wall():,.0f} s"
-        self._console.print(line)
+        returns = return_text(result["eval_return_mean"], result["eval_return_std"])
+        self._console.print(f"step {self.steps:,}: return {returns}, {self._wall():,.0f} s")
 
     def _speak(self) -> None:
         """Say now and then how far it is: who says nothing for long is taken for hanging."""

@@ -17,7 +17,7 @@ from rmc.analysis.history import History
 from rmc.analysis.statistics import ENOUGH_SEEDS, Scores, interquartile_mean, interval, probability_of_improvement
 from rmc.common.errors import ConfigError
 from rmc.common.extra import check_installed
-from rmc.deploy.monitor.figures import return_text
+from rmc.common.return_text import return_text
 
 Axis = Literal["env_steps", "updates", "wall_s"]
 LABELS = {"env_steps": "agent steps", "updates": "updates", "wall_s": "wall time (s)"}

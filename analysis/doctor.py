@@ -11,6 +11,7 @@ from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.metrics_tail import MetricsTail
+from rmc.deploy.run.state import remedy
 from rmc.deploy.run.validation import validate
 
 LEAST_SECONDS = 5.0  # of training; fewer say nothing
@@ -53,6 +54,6 @@ def examine_run(folder: RunFolder) -> tuple[list[Finding], float]:
     config, records = folder.config(), MetricsTail(folder.metrics).take()
     findings, seconds = examine(records, config), Vitals(records).training().seconds
     if not findings and seconds < LEAST_SECONDS:
-        fix = f"it has {seconds:.0f} s of training on record, the doctor needs {LEAST_SECONDS:.0f}; train it for longer"
-        raise ConfigError("RUN", str(folder.path), fix)
+        fault = f"it has {seconds:.0f} s of training on record, the doctor needs {LEAST_SECONDS:.0f}"
+        raise ConfigError("RUN", str(folder.path), f"{fault}; {remedy(folder)}")
     return findings, seconds

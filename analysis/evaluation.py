@@ -15,7 +15,7 @@ from rmc.common.agent import initial_agent
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.make import first_env
 from rmc.common.env.wrappers import Env
-from rmc.common.errors import ConfigError
+from rmc.common.errors import ConfigError, EnvFault
 from rmc.common.policy_header import PolicyHeader
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.env_sizes import check_sizes, env_sizes, layout_sizes
@@ -26,13 +26,21 @@ Watch = Callable[[Rollout], None]
 
 
 class EvaluationProgress:
-    """Prints now and then how far an evaluation is."""
+    """Prints now and then how far an evaluation is; one that ``keeps`` is cut by an interrupt."""
 
-    def __init__(self, console: Console, what: str) -> None:
+    def __init__(self, console: Console, what: str, keeps: bool = False) -> None:
         self._console, self._what, self._due = console, what, time.monotonic() + SAY_SECONDS
+        self._keeps = keeps
+        self._rollout: Rollout | None = None
+
+    @property
+    def stopped(self) -> bool:
+        """Whether the evaluation was interrupted, and its episodes that were over are kept."""
+        return self._rollout is not None and self._rollout.stopped
 
     def __call__(self, rollout: Rollout) -> None:
         """After each step."""
+        self._rollout, rollout.keeps = rollout, self._keeps
         if time.monotonic() >= self._due:
             self._due = time.monotonic() + SAY_SECONDS
             at = f"episode {rollout.episode + 1} of {rollout.episodes}, {rollout.steps:,} steps"
@@ -49,13 +57,17 @@ def evaluate_blob(
 ) -> dict[str, Any]:
     """Deterministic episodes of a policy, cut after ``seconds`` (0: never): mean, deviation and number of returns.
 
-    Raises ConfigError where its environment cannot be made, or has other sizes than the policy.
+    Raises ConfigError where its environment cannot be made, or has other sizes than the policy; EnvFault where it
+    breaks in every episode.
     """
     env = header.env if flicker is None else dataclasses.replace(header.env, flicker=flicker)
     runner = policy_runner(header, blob)
     with one_thread():
         seed = first_start(header.seed, final=True)
-        rollout = play_episodes(runner, lambda: policy_env(header, env), episodes, seed, seconds, watch)
+        try:
+            rollout = play_episodes(runner, lambda: policy_env(header, env), episodes, seed, seconds, watch)
+        except EnvFault as fault:
+            raise EnvFault(f"{fault}; rmc check-env {env.id} says more") from fault
     return evaluation_record(rollout) | missing_shares(env)
 
 

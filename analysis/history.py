@@ -24,6 +24,7 @@ from rmc.deploy.run.opening import SAME_AGENT
 from rmc.deploy.run.option_names import changes, flat, option
 from rmc.deploy.run.presets import preset_config
 from rmc.deploy.run.starts import begun_with, starts
+from rmc.deploy.run.state import remedy
 
 OMITTED = SAME_AGENT | {"seed", "preset", "env.id"}  # makes no other agent
 
@@ -117,7 +118,7 @@ def of_run(folder: RunFolder) -> History:
         mean, std = result["eval_return_mean"], result["eval_return_std"]
         evaluations.append(Evaluation(result["env_steps"], result["updates"], result["wall_s"], mean, std))
     if not evaluations:
-        fix = "it has no evaluation yet that was played to its end; train it for longer"
+        fix = f"it has no evaluation yet that was played to its end; {remedy(folder)}"
         raise ConfigError("RUNS", str(folder.path), fix)
     last = dataclasses.asdict(evaluations[-1]) | result
     return History(

@@ -15,8 +15,10 @@ UNREACHED = (ConnectionError, TimeoutError, RuntimeError)  # of hf-xet, through 
 
 
 def check_hub(repo: str) -> None:
-    """Raises ConfigError where the hub's library is missing."""
+    """Raises ConfigError where the hub's library is missing, or the repository has no owner."""
     check_installed("hub", ("huggingface_hub",), "REPO", repo)
+    if "/" not in repo:  # the hub would make it, and find nothing under that name afterwards
+        raise ConfigError("REPO", repo, "no repository's name; give owner/name")
 
 
 def push(repo: str, files: Mapping[str, bytes], private: bool) -> str:

@@ -157,12 +157,14 @@ class Policy:
         raw = self._numbers(observation)
         rows, one = self._rows(raw), raw.ndim == 1
         try:
-            flags = np.array(missing, bool)
+            given = np.array(missing)
         except ValueError:  # rows of several lengths
             raise ConfigError(
                 "missing", reprlib.repr(missing), f"give one, or one for each of {len(rows)} rows"
             ) from None
-        absent = self._absent(flags, rows, one)
+        if given.dtype.kind in "SU":  # any text but an empty one would count as true
+            raise ConfigError("missing", reprlib.repr(missing), "give True or False, not text")
+        absent = self._absent(given.astype(bool), rows, one)
         odd = ~np.isfinite(rows) & ~absent
         if odd.any():
             if not self.header.agent.impute_missing:

@@ -21,11 +21,15 @@ from rmc.common.policy_header import METADATA_KEY, PolicyHeader
 from rmc.common.user_path import user_path
 from rmc.deploy.run.checkpoint_choice import choose_checkpoint
 from rmc.deploy.run.config import from_dict
-from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.folder import RunFolder, near_run
 from rmc.deploy.run.metrics_tail import MetricsTail
 from rmc.deploy.run.migrations import FORMAT, migrated
 from rmc.deploy.run.validation import validate
 
+OF_SUFFIX = {  # what a file is that is no policy's
+    ".safetensors": "",
+    ".onnx": "it is for onnxruntime; give its run, or what rmc export RUN --out policy.safetensors writes",
+}
 EVALUATED = ("return_mean", "return_std", "episodes")
 
 
@@ -61,12 +65,13 @@ def read_policy(source: str | Path, checkpoint: str = "latest") -> PolicyFile:
     try:
         blob = path.read_bytes()
     except OSError as error:
-        fix = "give a run's folder or a policy.safetensors"
-        raise ConfigError("RUN", str(path), f"cannot be read ({error.strerror}); {fix}") from None
+        fix = near_run(path, "; give a run's folder or a policy.safetensors")
+        raise ConfigError("RUN", str(path), f"cannot be read ({error.strerror}){fix}") from None
     try:
         return decode(blob)
     except MessageError as error:
-        raise ConfigError("policy file", str(path), str(error)) from None
+        other = OF_SUFFIX.get(path.suffix.lower(), "no policy's file; give a run's folder or a policy.safetensors")
+        raise ConfigError("policy file", str(path), other or str(error)) from None
 
 
 def decode(blob: bytes) -> PolicyFile:

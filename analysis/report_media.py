@@ -10,6 +10,7 @@ from rmc.analysis.policy import load_policy
 from rmc.analysis.report_figures import data_uri
 from rmc.analysis.report_run import ReportRun
 from rmc.common.errors import ConfigError, RmcError
+from rmc.common.return_text import return_text
 from rmc.deploy.run.checkpoint_choice import checkpoint_number
 
 LONGEST_FILM = 1_000  # steps: the page holds it
@@ -52,7 +53,7 @@ def film(run: ReportRun, checkpoint: str) -> Medium:
             return Medium(
                 run.name,
                 data_uri(out.read_bytes(), "video/mp4"),
-                f"return {total:,.1f} over its first {LONGEST_FILM:,} steps at most",
+                f"return {return_text(total)} over its first {LONGEST_FILM:,} steps at most",
             )
     except RmcError as error:
         return Medium(run.name, note=f"No video: {_why(error)}.")

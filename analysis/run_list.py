@@ -11,7 +11,7 @@ from rich.text import Text
 from rmc.analysis.run_paths import run_folders
 from rmc.common.bus.metrics_record import is_complete
 from rmc.common.errors import ConfigError
-from rmc.deploy.monitor.figures import duration, number
+from rmc.deploy.monitor.figures import duration, known_return, number
 from rmc.deploy.monitor.recorded import recorded_status
 from rmc.deploy.monitor.table import STYLES, plain_table
 from rmc.deploy.run.folder import RunFolder
@@ -93,8 +93,8 @@ def _cells(one: RunSummary, folder: Path) -> dict[str, str | Text]:
         "run": os.path.relpath(one.run, folder),
         "state": Text(one.state, STYLES.get(one.state, "red")),
         "steps": number(one.env_steps, ","),
-        "return": number(one.eval_return, ",.1f"),
-        "best": number(one.best_return, ",.1f"),
+        "return": known_return(one.eval_return),
+        "best": known_return(one.best_return),
         "done": number(done, ".0%"),
         "time": duration(one.elapsed_s),
         "env": one.env or number(None),

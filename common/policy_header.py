@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from rmc.common.agent_config import AgentConfig
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.layout import EnvLayout
+from rmc.common.return_text import return_text
 
 METADATA_KEY = "rmc.policy"
 
@@ -64,7 +65,7 @@ class PolicyHeader:
         """Its evaluation in words; empty where there was none."""
         if self.eval_return_mean is None or self.eval_return_std is None:
             return ""
-        return f"{self.eval_return_mean:,.1f} ± {self.eval_return_std:,.1f} over {self.eval_episodes} episodes"
+        return f"{return_text(self.eval_return_mean, self.eval_return_std)} over {self.eval_episodes} episodes"
 
     def metadata(self) -> dict[str, str]:
         """For a file's own metadata, which holds text."""

@@ -7,6 +7,7 @@ module by module, those with trainings of their own first.
 import os
 import shutil
 import signal
+import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import suppress
@@ -26,6 +27,7 @@ LONG = "integration/", "sweep/", "docs/", "faults/", "cli/", "packaging/"  # wit
 NICENESS = 10
 WORKER = "PYTEST_XDIST_WORKER" in os.environ
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch starts its threads: small products only, few cores
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as rmc has it: threads that spin starve the other worker
 TEMPORARY = tempfile.mkdtemp(prefix="rmct-")  # so that what other runs on this machine leave is not taken for ours
 os.environ["TMPDIR"] = tempfile.tempdir = TEMPORARY
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # begun in the background: what is tested must hear a Ctrl-C
@@ -112,6 +114,11 @@ def _left_over() -> set[str]:
     return children | temporary
 
 
+def _torch_threads() -> float:
+    torch = sys.modules.get("torch")
+    return torch.get_num_threads() if torch else float("inf")
+
+
 def _running_children() -> list[psutil.Process]:
     results = []
     for child in psutil.Process().children(recursive=True):
@@ -132,10 +139,11 @@ def no_environment_has_changed_the_process(monkeypatch: pytest.MonkeyPatch) -> N
 
 @pytest.fixture(autouse=True)
 def leaves_nothing_behind(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Fails a test after which a process or a run's temporary folder is left."""
+    """Fails a test after which a process or a run's temporary folder is left, or torch with more threads."""
     if "redis_url" in request.fixturenames:
         request.getfixturevalue("redis_url")  # the session's server starts before the first look
-    before = _left_over()
+    before, threads = _left_over(), _torch_threads()
     yield
     left = _left_over() - before
     assert not left, f"left behind: {sorted(left)}"
+    assert _torch_threads() <= threads, "torch is left with more threads; the tests after this one would have them"

@@ -201,6 +201,13 @@ class Masked(gym.ObservationWrapper[Any, Any, Any]):
         return observation
 
 
+class Dead(gym.Wrapper[Any, Any, Any, Any]):
+    """Breaks in its first step."""
+
+    def step(self, action: Any) -> Any:
+        raise RuntimeError("it is dead")
+
+
 for _kind in (Slide, *Slide.__subclasses__(), Masked, LateSpaces):
     gym.register(f"{_kind.__name__}-v0", entry_point=_kind)
 gym.register("NoModule-v0", entry_point="tests.nowhere:Env")

@@ -48,11 +48,20 @@ def _unknown(module: str, name: str) -> str:
     newest = [one.id for one in gym.registry.values() if one.version == find_highest_version(one.namespace, one.name)]
     close = difflib.get_close_matches(name, newest, n=3, cutoff=0.7)
     fix = f"did you mean {', '.join(close)}?" if close else "use a gymnasium id or module:EnvId-v0"
-    if close and not module:
+    own = Path(name).parent / f"{Path(name).stem}.py"
+    if not module and os.path.isfile(own):
+        fix = f"{own} is here: give {_module_name(own)}:EnvId-v0"
+    elif close and not module:
         fix = f"{fix} One of your own is module:{name}"
     file = getattr(sys.modules.get(module), "__file__", None)
     where = f"{module} ({file})" if file else module
     return f"{where} registers no {name} (gymnasium.register); {fix}" if module else f"no such environment; {fix}"
+
+
+def _module_name(path: Path) -> str:
+    """What a file that is given by its path is imported by: below the working folder with its packages."""
+    parts = Path(os.path.relpath(path)).parts
+    return ".".join(parts[-1:] if ".." in parts else parts).removesuffix(".py").lstrip(".") or "module"
 
 
 def _shadow_fault(module: str) -> str | None:
@@ -68,11 +77,10 @@ def _shadow_fault(module: str) -> str | None:
 
 def _import_users_module(env_id: str, module: str) -> None:
     """Found in the working folder, too, but there last, so that it cannot shadow ours."""
-    if module.endswith(".py"):
-        right = f"{Path(module).stem}:{env_id.rpartition(':')[2]}"
-        raise ConfigError(
-            "ENV", env_id, f"give the module's name, not its file: {right}, from the folder that holds it"
-        )
+    if module.endswith(".py") or module.startswith(".") or "/" in module:
+        kind, right = "file" if module.endswith(".py") else "path", _module_name(Path(module))
+        fix = f"give the module's name, not its {kind}: {right}:{env_id.rpartition(':')[2]}"
+        raise ConfigError("ENV", env_id, f"{fix}, from the folder that holds {right.partition('.')[0]}")
     folder = os.getcwd()
     if folder not in sys.path:
         sys.path.append(folder)

@@ -3,6 +3,7 @@
 from typing import Any
 
 from rmc.common.bus.metrics_record import is_finite
+from rmc.common.return_text import return_text
 
 NONE_YET = "–"
 DAY, LONGEST = 86_400, 999 * 86_400  # seconds
@@ -13,9 +14,9 @@ def number(value: Any, form: str = ",.3g") -> str:
     return NONE_YET if value is None else format(value, form)
 
 
-def return_text(value: float) -> str:
-    """A return: whole where it is large, else four digits of it."""
-    return number(value, ",.0f" if abs(value) >= 1000 else ",.4g")
+def known_return(value: float | None) -> str:
+    """A return as text, or a dash where there is none yet."""
+    return NONE_YET if value is None else return_text(value)
 
 
 def time_and_eta(elapsed_s: float | None, eta_s: float | None, is_over: bool) -> str:

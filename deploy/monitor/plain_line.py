@@ -1,6 +1,7 @@
 """The state of a run as one line, for where there is no terminal."""
 
-from rmc.deploy.monitor.figures import number, return_text, time_and_eta
+from rmc.common.return_text import return_text
+from rmc.deploy.monitor.figures import number, time_and_eta
 from rmc.deploy.monitor.notices import notices, waits
 from rmc.deploy.monitor.run_status import RunStatus
 

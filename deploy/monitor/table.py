@@ -11,7 +11,8 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from rmc.deploy.monitor.figures import number, time_and_eta
+from rmc.common.return_text import return_text
+from rmc.deploy.monitor.figures import known_return, number, time_and_eta
 from rmc.deploy.monitor.notices import count, notices, waits
 from rmc.deploy.monitor.run_status import EvaluationStatus, RunStatus
 
@@ -107,7 +108,7 @@ def _evaluation(evaluation: EvaluationStatus | None) -> str:
         return number(None)
     steps = evaluation.env_steps
     at = f"step {steps:,}" if steps is not None else f"update {number(evaluation.update, ',')}"
-    return f"{number(evaluation.return_mean, ',.1f')} ± {number(evaluation.return_std, ',.1f')} at {at}"
+    return f"{return_text(evaluation.return_mean, evaluation.return_std)} at {at}"
 
 
 def _details(status: RunStatus) -> list[Fact]:
@@ -115,7 +116,7 @@ def _details(status: RunStatus) -> list[Fact]:
     learner, ratio = status.roles.get("learner", {}), status.replay("replay_ratio", mean)
     losses = ", ".join(f"{name[:-5]} {number(learner[name])}" for name in learner if name.endswith("_loss"))
     facts = [
-        ("episodes", f"return {number(status.episode_return, ',.1f')}, with exploration"),
+        ("episodes", f"return {known_return(status.episode_return)}, with exploration"),
         ("losses", losses or number(None)),
         ("replay", f"ring {number(status.replay('ring_fill', mean), '.0%')} full, "
                    f"ratio {number(ratio, ',.1f')}" + ("" if ratio is None else f" of {status.replay_ratio:g}")),

@@ -3,6 +3,7 @@
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import CheckpointError, ConfigError
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.state import remedy
 
 
 def choose_checkpoint(folder: RunFolder, which: str) -> tuple[int, dict[str, bytes]]:
@@ -21,7 +22,7 @@ def checkpoint_number(folder: RunFolder, which: str) -> int:
     checkpoints, which = CheckpointFolder(folder.checkpoints), str(which)
     numbers = checkpoints.numbers()
     if not numbers:
-        raise ConfigError("RUN", str(checkpoints.folder.parent), "it has no checkpoint yet; train it for longer")
+        raise ConfigError("RUN", str(folder.path), f"it has no checkpoint yet; {remedy(folder)}")
     if which == "latest":
         return numbers[-1]
     if which == "best":

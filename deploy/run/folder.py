@@ -21,6 +21,7 @@ from rmc.common.whole_file import NO_ROOM, private_temporary, write_synced, writ
 from rmc.deploy.run.config import RunConfig, from_json, to_json
 from rmc.deploy.run.env_sizes import check_sizes
 from rmc.deploy.run.migrations import migrated
+from rmc.deploy.run.option_names import did_you_mean
 from rmc.deploy.run.run_lock import RunLock
 
 log = logging.getLogger(__name__)
@@ -94,7 +95,7 @@ class RunFolder:
         try:
             raw = read_object(self.path / "config.json")
         except (FileNotFoundError, NotADirectoryError):
-            raise ConfigError("RUN", str(self.path), "no config.json there; give the folder of a run") from None
+            raise ConfigError("RUN", str(self.path), self._why_no_run()) from None
         except OSError as error:
             raise ConfigError("RUN", str(self.path), f"config.json cannot be read ({error.strerror})") from None
         try:
@@ -102,6 +103,17 @@ class RunFolder:
             return settings
         except ConfigError as error:
             raise ConfigError("RUN", str(self.path), str(error)) from None
+
+    def _why_no_run(self) -> str:
+        """What is there in place of a run's folder, and what to give."""
+        if not os.path.exists(self.path):
+            return f"is not there{near_run(self.path, '; give the folder of a run')}"
+        run = self.path.parent.parent
+        if self.path.name.isdecimal() and (run / "config.json").exists():
+            return f"is a checkpoint; give its run, {run.name}, with --checkpoint {int(self.path.name)}"
+        if next(self.path.glob("*/config.json"), None) is not None:
+            return "holds runs; give one of them, as rmc list names them"
+        return "no config.json there; give the folder of a run"
 
     def is_baseline(self) -> bool:
         """Whether ``rmc baseline`` made it. Raises ConfigError where this is no run's folder."""
@@ -209,6 +221,12 @@ class RunFolder:
     def writable(self) -> bool:
         """Whether files can be made in it."""
         return os.access(self.path, os.W_OK, effective_ids=os.access in os.supports_effective_ids)
+
+
+def near_run(path: Path, otherwise: str) -> str:
+    """The end of a message on a path: where nothing is there, the run beside it of the nearest name."""
+    beside = [] if os.path.exists(path) else path.parent.glob("*/config.json")
+    return did_you_mean(path.name, (file.parent.name for file in beside), otherwise)
 
 
 def _link(temporary: Path, path: Path) -> None:

@@ -89,9 +89,9 @@ def check_ring_fits(config: RunConfig, options: LaunchOptions) -> None:
     free_disk = shutil.disk_usage(existing_parent((options.run_dir or Path("runs")).absolute())).free
     room = ring_bytes_there(config, options) + max(0, free_disk - DISK_RESERVE)
     if size > room:
-        rest = f"{size_text(free_disk)} are free, {size_text(DISK_RESERVE)} of which are left for checkpoints and logs"
+        needs = f"takes {size_text(size)} of disk beside {size_text(DISK_RESERVE)} for checkpoints and logs"
         fix = f"take at most {most(room)}" if most(room) else "make room"
-        raise ConfigError("--capacity", capacity, f"takes {size_text(size)} of disk, {rest}; {fix}")
+        raise ConfigError("--capacity", capacity, f"{needs}, {size_text(free_disk)} are free; {fix}")
     memory = memory_limit()
     if size > memory:
         fix = f"take at most {most(memory)}" if most(memory) else "take a machine with more"

@@ -3,6 +3,7 @@
 ``.lock`` holds ``training PID MACHINE CONTAINER BOOT`` while a launcher trains the run, then ``ended STATUS``.
 """
 
+import errno
 import fcntl
 import os
 import re
@@ -30,9 +31,15 @@ class RunLock:
         self._before = ""  # what the last launcher has left in it
 
     def take(self) -> None:
-        """Be the one launcher of this run. Raises ConfigError where another one is."""
+        """Be the one launcher of this run. Raises ConfigError where another one is, or the folder cannot be written."""
         self.check_untrained()
-        self._handle = take_lock(self._file, LOCK_SECONDS)
+        try:
+            self._handle = take_lock(self._file, LOCK_SECONDS)
+        except OSError as error:
+            if error.errno not in (errno.EROFS, errno.EACCES):
+                raise
+            fix = f"cannot be written ({error.strerror}); copy the run elsewhere, or make it writable"
+            raise ConfigError("RUN", str(self._folder), fix) from None
         if self._handle is None:
             raise self._is_trained()
         self._locked_folder, self._before = self._folder.stat(), self._file.read_text(errors="replace")

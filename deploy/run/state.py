@@ -19,6 +19,13 @@ def run_state(folder: RunFolder) -> State:
         return "unknown" if folder.result() is None else "finished"
 
 
+def remedy(folder: RunFolder) -> str:
+    """What helps a run that has too little on record. Raises ConfigError, OSError."""
+    if run_state(folder) == "failed" and (folder.logs / "launcher.log").exists():
+        return "it failed, and logs/launcher.log says why"
+    return "train it for longer"
+
+
 def _locked_state(folder: RunFolder) -> State:
     if folder.lock.trainer() is not None:
         return "training"

@@ -64,9 +64,8 @@ def validate(config: RunConfig) -> None:
     _validate_agent(config)
     _validate_actors(config)
     if config.total_steps <= config.replay.warmup_steps:
-        raise ConfigError(
-            "--total-steps", config.total_steps, f"take more than --warmup-steps={config.replay.warmup_steps}"
-        )
+        fix = f"take more than --warmup-steps={config.replay.warmup_steps}, which a new run may lower"
+        raise ConfigError("--total-steps", config.total_steps, fix)
 
 
 def _validate_agent(config: RunConfig) -> None:

@@ -6,7 +6,9 @@ import itertools
 import re
 from collections.abc import Sequence
 
+from rmc.cli import config_file
 from rmc.cli.parser import COMMANDS, option_names, parse
+from rmc.common.errors import ConfigError
 from rmc.deploy.run.option_names import did_you_mean, option
 
 SAYS_ON_OR_OFF = re.compile("true|false|yes|no|on|off", re.IGNORECASE)
@@ -15,10 +17,18 @@ ENDS = ("For full helptext", "Argument helptext", "Arguments are applied", "Perh
 
 def about(words: Sequence[str], named: Sequence[str]) -> str:
     """What is wrong with words that cannot be parsed, in a line that quotes them; ``named`` begin with the command."""
+    message = as_line(_boxed(words), named)
+    file = config_file.named(words) if words[:1] == ["train"] else None
+    of_file = file is not None and not _boxed(config_file.without_file(words))
+    return f"{config_file.OPTION} {file}: {message}" if of_file else message
+
+
+def _boxed(words: Sequence[str]) -> str:
+    """What tyro prints of them; nothing where they can be parsed."""
     plain = contextlib.redirect_stdout(io.StringIO())  # where it is a terminal, tyro has colours for both
-    with plain, contextlib.redirect_stderr(io.StringIO()) as stderr, contextlib.suppress(SystemExit):
+    with plain, contextlib.redirect_stderr(io.StringIO()) as stderr, contextlib.suppress(SystemExit, ConfigError):
         parse(list(words))
-    return as_line(stderr.getvalue(), named)
+    return stderr.getvalue()
 
 
 def as_line(boxed: str, words: Sequence[str]) -> str:

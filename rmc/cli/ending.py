@@ -6,6 +6,7 @@ from rich.console import Console
 
 from rmc.analysis.doctor import examine
 from rmc.common.errors import STOPPED_STATUS, RoleDied
+from rmc.common.return_text import return_text
 from rmc.deploy.local.launcher import saved_steps
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.metrics_tail import MetricsTail
@@ -30,9 +31,8 @@ def print_end(folder: RunFolder, console: Console) -> int:
 
 def format_evaluation(evaluation: dict[str, Any]) -> str:
     """Mean and deviation of the returns, and how many there are."""
-    mean, deviation = evaluation["eval_return_mean"], evaluation["eval_return_std"]
     over = f"over {episode_count(evaluation['eval_episodes'], 'deterministic ')}{cut_note(evaluation)}"
-    return f"return {mean:,.1f} ± {deviation:,.1f} {over}"
+    return f"return {return_text(evaluation['eval_return_mean'], evaluation['eval_return_std'])} {over}"
 
 
 def episode_count(count: int, kind: str = "") -> str:

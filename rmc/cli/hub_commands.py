@@ -5,7 +5,6 @@ from rmc.analysis.out_file import check_writable
 from rmc.analysis.policy_file import read_policy
 from rmc.cli import hub_options
 from rmc.common.checkpoint import POLICY
-from rmc.common.errors import ConfigError
 from rmc.common.whole_file import write_whole
 from rmc.deploy.monitor.view import terminal
 
@@ -17,8 +16,6 @@ def run_hub(command: hub_options.Hub) -> int:
 
 def _push(action: hub_options.Push) -> int:
     hub.check_hub(action.repo)
-    if "/" not in action.repo:  # the hub would make it, and find nothing under that name afterwards
-        raise ConfigError("REPO", action.repo, "no repository's name; give owner/name")
     policy = read_policy(action.run, action.checkpoint)
     text = model_card.card(policy.header, action.repo, action.license)
     files = {POLICY: policy.encode(), hub.CARD: text.encode()}

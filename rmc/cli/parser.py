@@ -92,7 +92,9 @@ def parse(words: list[str]) -> Any:
     if of_run is not None:
         return _parsed(words, of_run)
     if isinstance(command, train_options.Train) and not command.env.id:
-        raise ConfigError("ENV", "", "rmc train takes an environment, like HalfCheetah-v5, or --run-dir with a run")
+        fix = "rmc train takes an environment, like HalfCheetah-v5, or --run-dir with a run"
+        none = command.run_dir is not None and not (command.run_dir / "config.json").exists()
+        raise ConfigError("ENV", "", f"{fix}; {command.run_dir} holds none" if none else fix)
     return command
 
 

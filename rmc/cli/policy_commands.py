@@ -20,8 +20,9 @@ from rmc.cli import run_options
 from rmc.cli.ending import cut_note, episode_count
 from rmc.cli.signals import signals_caught
 from rmc.common.env.config import RANGES, check_range
-from rmc.common.errors import ConfigError
+from rmc.common.errors import STOPPED_STATUS, ConfigError
 from rmc.common.process.redirect import redirected
+from rmc.common.return_text import return_text
 from rmc.common.whole_file import write_whole
 from rmc.deploy.monitor.view import terminal
 
@@ -39,14 +40,18 @@ def evaluate(command: run_options.Evaluate) -> int:
         policy = _policy(command)
         if policy is not None and command.video is not None:
             video.prepare(policy.header.env, command.video)
-    watch = EvaluationProgress(Console(stderr=True, markup=False, emoji=False, highlight=False), str(command.run))
+    console = Console(stderr=True, markup=False, emoji=False, highlight=False)
+    watch = EvaluationProgress(console, str(command.run), keeps=True)
     for probability in command.flicker or (None,):
         with aside():
             played = evaluate_run(
                 policy or command.run, command.episodes, command.checkpoint, probability, command.seconds, watch,
                 command.env_timeout,
             )  # fmt: skip
-        terminal().print(json.dumps(played) if command.json else _result_line(played), soft_wrap=True)
+        words = json.dumps(played) if command.json else _result_line(played, watch.stopped)
+        terminal().print(words, soft_wrap=True)
+        if watch.stopped:
+            return STOPPED_STATUS
     if policy is not None and command.video is not None:
         with aside():
             _film(command, policy, command.video)
@@ -68,16 +73,16 @@ def _film(command: run_options.Evaluate, policy: PolicyFile, file: Path) -> None
     env = dataclasses.replace(env, flicker=command.flicker[0]) if command.flicker else env
     total = video.record(Policy(policy), env, policy.header.seed, file)
     if not command.json:
-        terminal().print(f"{file}: an episode with return {total:,.1f}", soft_wrap=True)
+        terminal().print(f"{file}: an episode with return {return_text(total)}", soft_wrap=True)
 
 
-def _result_line(played: dict[str, Any]) -> str:
-    mean, deviation = played["eval_return_mean"], played["eval_return_std"]
+def _result_line(played: dict[str, Any], stopped: bool) -> str:
+    returns = return_text(played["eval_return_mean"], played["eval_return_std"])
     shares = {"frames": played["eval_flicker"], "sensors": played["eval_drop_sensors"]}
     missing = " and ".join(f"{share:.0%} of the {name}" for name, share in shares.items() if share)
     env = f"{played['env']} with {missing} missing" if missing else played["env"]
-    text = f"{env}: return {mean:,.1f} ± {deviation:,.1f} over {episode_count(played['eval_episodes'])}"
-    return f"{text}{cut_note(played)}, after {played['env_steps']:,} steps"
+    text = f"{env}: return {returns} over {episode_count(played['eval_episodes'])}"
+    return f"{text}{', cut when it was stopped' if stopped else cut_note(played)}, after {played['env_steps']:,} steps"
 
 
 def export_policy(command: run_options.Export) -> int:
@@ -106,9 +111,8 @@ def inspect(command: run_options.Inspect) -> int:
         console.print(f"critics are not compared with returns: that takes {needed}", soft_wrap=True)
     else:
         counted = f"with the entropy's bonus, without curiosity, over {value.steps:,} steps"
-        console.print(
-            f"critics expect {value.expected:,.1f} on average; {value.came:,.1f} came, {counted}", soft_wrap=True
-        )
+        expected, came = return_text(value.expected), return_text(value.came)
+        console.print(f"critics expect {expected} on average; {came} came, {counted}", soft_wrap=True)
     console.print(*memory_picture.tables(memory), sep="\n")
     console.print(f"{command.out}", soft_wrap=True)
     return 0

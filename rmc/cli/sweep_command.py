@@ -163,7 +163,7 @@ def _conduct(command: Sweep, work: Work, checked: list[Checked], index: Index) -
     with signals_caught() as stop:
         if work.todo:
             with _place(command, work.todo, checked) as (place, about):
-                summary = f"{work.total} runs in {folder}, {over} of them over; {about}"
+                summary = f"{_count(work.total, 'run')} in {folder}, {over} over; {about}"
                 console.print(summary, soft_wrap=True)
                 _warn_of_empty_rings(work.todo)
                 conduct(work.plan, place, stop, index.begin, ended)
@@ -175,6 +175,10 @@ def _conduct(command: Sweep, work: Work, checked: list[Checked], index: Index) -
             f"{remaining} not over; the same command goes on; {folder / NAME} has their words", soft_wrap=True
         )
     return STOPPED_STATUS if stop.requested else int(remaining > 0)
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'s' * (number != 1)}"
 
 
 def _warn_of_empty_rings(todo: list[Job]) -> None:
@@ -197,11 +201,11 @@ def _place(command: Sweep, todo: list[Job], checked: list[Checked]) -> Iterator[
         fit = 1 if gpus else room.runs_that_fit(cores, memory)
         at_once = min(len(todo), command.jobs or fit)
         room.check_disk(todo[0].folder.parent, todo, ring, at_once, command.drop_replay)
-        yield LocalRuns(at_once), f"{at_once} at a time, of {cores_here()} cores"
+        yield LocalRuns(at_once), f"{at_once} at a time, of {_count(cores_here(), 'core')}"
         return
     from rmc.deploy.ray.launcher import joined  # Ray is an extra, and slow to import
     from rmc.sweep.ray_runs import RayRuns
 
     with joined(command.ray_address, max(cores, cores_here())):
         place = RayRuns(cores, memory, gpus, command.jobs)
-        yield place, f"up to {place.capacity()} at a time, each with {cores} CPUs of a node"
+        yield place, f"up to {place.capacity()} at a time, each with {_count(cores, 'CPU')} of a node"

@@ -208,10 +208,12 @@ def read_ranges(words: Sequence[str]) -> dict[str, Range | list[Any]]:
     ranges: dict[str, Range | list[Any]] = {}
     for name, text in _pairs("--search", words):
         ends = re.fullmatch(r"([^,]+?)\.\.([^,]+?)(:log)?", text)
-        if ends is None:
-            ranges[name] = read_values(text)
-        else:
+        if ends is not None:
             ranges[name] = _checked_range(f"search.{name}", _number(ends[1]), _number(ends[2]), bool(ends[3]))
+            continue
+        ranges[name] = read_values(text)
+        if re.match(r"[-+.]?\d", text) and ranges[name] == [text]:  # a range that is written in another way
+            raise ConfigError(f"search.{name}", text, "write LOW..HIGH, LOW..HIGH:log, or choices with commas between")
     return ranges
 
 

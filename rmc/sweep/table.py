@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from rich.table import Table
 
+from rmc.common.return_text import return_text
 from rmc.sweep.index import Index
 from rmc.sweep.job import TRIAL, Job, value_text
 
@@ -32,20 +33,22 @@ def _row(runs: list[Job], index: Index, names: list[str]) -> tuple[float, list[s
     finished = [index.lines[job.name] for job in runs if index.state(job) == "finished"]
     returns = [line["return"] for line in finished if line["return"] is not None]
     mean = float(np.mean(returns)) if returns else -np.inf
-    deviation = f" ± {np.std(returns, ddof=1):,.1f}" if len(returns) > 1 else ""
+    deviation = float(np.std(returns, ddof=1)) if len(returns) > 1 else None
     others = [index.state(job) for job in runs if index.state(job) != "finished"]
     counts = ", ".join(f"{others.count(state)} {state}" for state in dict.fromkeys(others))
     is_trial = runs[0].is_trial  # whose values were drawn, with all their digits
     drawn = (runs[0].values[name] for name in names)  # trials of another command may have another order
     values = (f"{one:.4g}" if is_trial and isinstance(one, float) else value_text(one) for one in drawn)
-    text = f"{mean:,.1f}{deviation}" if returns else "-"
+    text = return_text(mean, deviation) if returns else "-"
     return mean, [runs[0].name.removeprefix(TRIAL), *values, str(len(returns)), text, counts]
 
 
 def run_line(job: Job, index: Index) -> str:
     """How one run ended, for a line."""
     line = index.lines[job.name]
-    returned = "" if line["return"] is None else f"return {line['return']:,.1f} after {line['env_steps']:,} steps, "
+    returned = ""
+    if line["return"] is not None:
+        returned = f"return {return_text(line['return'])} after {line['env_steps']:,} steps, "
     state = "" if line["state"] == "finished" else f"{line['state']}: "
     reason = f"; {line['reason']}" if line["reason"] else ""
     return f"{job.title}: {state}{returned}{line['seconds']:,.0f} s{reason}"

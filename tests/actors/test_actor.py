@@ -31,6 +31,7 @@ from rmc.common.window import Rows, WindowSpec, joined
 from rmc.common.wire import decode_rows
 from tests.broken_env import BREAKS_AT, FAULTS
 from tests.counting_env import ACTION_DIM, OBS_DIM, CountingEnv, Step, audit
+from tests.habits import Dead
 from tests.learner.rows import step_valid
 
 AGENT = AgentConfig(hidden=8, embedding=8, heads=(8, 8))
@@ -517,10 +518,6 @@ def test_a_window_holds_the_agents_own_actions() -> None:
 
 
 def test_an_environment_that_always_breaks_at_once_ends_the_actor() -> None:
-    class Dead(gym.Wrapper[Any, Any, Any, Any]):
-        def step(self, action: Any) -> Any:
-            raise RuntimeError("it is dead")
-
     actor, reader = begun(MemoryBus(), make=lambda: Dead(make_env(COUNTING)))
     with pytest.raises(RuntimeError, match="it is dead"):
         play(actor, reader, 2000)

@@ -1,6 +1,7 @@
 """The evaluator: whole deterministic episodes, side by side, and one record for each policy asked for."""
 
 import itertools
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from rmc.common.env.make import make_env
 from rmc.common.env.wrappers import Env, RescaledEnv
 from rmc.common.errors import ConfigError, RmcError
 from tests.counting_env import ACTION_DIM, OBS_DIM
+from tests.habits import Dead
 
 AGENT = AgentConfig(hidden=8, embedding=8, heads=(8, 8))
 PENDULUM = EnvConfig("Pendulum-v1")
@@ -175,13 +177,6 @@ def test_nonsense_is_refused() -> None:
         Evaluator(1, counting, AGENT, EvaluatorConfig(episodes=0), MemoryBus())
 
 
-class Dead(gym.Wrapper[Any, Any, Any, Any]):
-    """Breaks in its first step."""
-
-    def step(self, action: Any) -> Any:
-        raise RuntimeError("it is dead")
-
-
 def test_an_episode_that_breaks_is_left_out_and_its_environment_made_anew() -> None:
     runner = runner_for(Agent(OBS_DIM, ACTION_DIM, AGENT))
     sound = play_episodes(runner, counting, 3, seed=4).returns
@@ -281,6 +276,28 @@ def test_an_evaluation_is_told_by_mean_and_standard_deviation() -> None:
     told = evaluation_record(rollout)
     assert (told["eval_return_mean"], told["eval_return_std"]) == (pytest.approx(mean), pytest.approx(deviation))
     assert 0 < deviation != pytest.approx(deviation**2)
+
+
+@pytest.mark.parametrize(("keeps", "episode"), [(True, 2), (True, 0), (False, 2)])
+def test_an_interrupted_evaluation_keeps_what_is_over_where_it_is_to(keeps: bool, episode: int) -> None:
+    """Where nothing is over, or it is not to, the interrupt goes on; its environment is closed at any rate."""
+    rollouts: list[Rollout] = []
+    env, closed = counting(), []
+    env.close = lambda: closed.append(env)  # type: ignore[method-assign]
+
+    def watch(rollout: Rollout) -> None:
+        rollouts.append(rollout)
+        rollout.keeps = keeps
+        if rollout.episode == episode:
+            raise KeyboardInterrupt
+
+    runner = runner_for(Agent(OBS_DIM, ACTION_DIM, AGENT))
+    with nullcontext() if keeps and episode else pytest.raises(KeyboardInterrupt):
+        told = evaluation_record(play_episodes(runner, lambda: env, 5, 4, watch=watch))
+        assert (told["eval_episodes"], told["eval_cut"]) == (2, 1)
+    assert rollouts[0].returns == play_episodes(runner, counting, 5, 4).returns[:episode]
+    assert rollouts[0].stopped is (keeps and episode > 0)
+    assert closed
 
 
 @pytest.mark.parametrize("reward", [np.nan, np.inf])

@@ -32,13 +32,12 @@ def hub() -> Iterator[Hub]:
 
 @pytest.fixture(scope="module")
 def call(hub: Hub, tmp_path_factory: pytest.TempPathFactory) -> Call:
-    """Python in a process of its own, beside that hub; large files go the way of git-lfs, not through hf-xet."""
+    """Python in a process of its own, beside that hub."""
     home = tmp_path_factory.mktemp("home")
 
     def run(*words: str, folder: Path, token: str = TOKEN, **more: str) -> subprocess.CompletedProcess[str]:
-        named = {"HF_ENDPOINT": hub.url, "HF_HOME": str(home), "HF_TOKEN": token, "HF_HUB_DISABLE_XET": "1"}
         words = (sys.executable, *words)
-        environment = os.environ | named | more
+        environment = os.environ | hub.environment(home) | {"HF_TOKEN": token} | more
         return subprocess.run(words, cwd=folder, env=environment, capture_output=True, text=True, timeout=120)
 
     return run
@@ -52,7 +51,7 @@ def test_what_is_pushed_comes_back_and_its_card_says_what_it_is(hub: Hub, call: 
     result = {"eval_return_mean": -1234.5, "eval_return_std": 9.25, "eval_episodes": 10, "initial_return_mean": 0.0}
     run.write_result(result | {"env_steps": 70, "updates": 7, "wall_s": 1.0})
     pushed = call(*RMC, "push", "run", "me/swings", "--license", "mit", "--private", folder=tmp_path)
-    summary = "Pendulum-v1 after 70 steps, return -1,234.5 ± 9.2 over 10 episodes\n"
+    summary = "Pendulum-v1 after 70 steps, return -1,234 ± 9 over 10 episodes\n"
     assert (pushed.returncode, pushed.stderr) == (0, ""), pushed.stderr
     assert pushed.stdout == f"{hub.url}/me/swings: {summary}"
     assert hub.private == {"me/swings"}
@@ -65,7 +64,7 @@ def test_what_is_pushed_comes_back_and_its_card_says_what_it_is(hub: Hub, call: 
     assert (data["license"], data["library_name"], data["pipeline_tag"]) == ("mit", "rmc", "reinforcement-learning")
     (entry,) = data["model-index"][0]["results"]
     assert entry["metrics"][0]["value"] == "-1234.50 +/- 9.25"
-    for row in ("return, mean ± deviation | -1,234.5 ± 9.2 over 10 episodes", "agent steps | 70"):
+    for row in ("return, mean ± deviation | -1,234 ± 9 over 10 episodes", "agent steps | 70"):
         assert f"| {row} |" in text
     pulled = call(*RMC, "pull", "me/swings", "--out", "back.safetensors", folder=tmp_path, token="")
     assert (pulled.returncode, pulled.stderr, pulled.stdout) == (0, "", f"back.safetensors: {summary}")
@@ -83,13 +82,14 @@ def test_the_cards_lines_load_it(hub: Hub, call: Call, tmp_path: Path) -> None:
     assert "| return, mean ± deviation | not evaluated |" in text
     lines = text.split("```python\n")[1].split("```")[0]
     assert len([line for line in lines.splitlines() if line]) <= 5
-    code = f"observation = [1.0, 0.0, 0.5]\n{lines}\nprint(action.shape, abs(action[0]) <= 2)"
+    shown = "print(action.shape, abs(action[0]) <= 2)"
+    played = "from rmc.cli import main\nprint(main.run(['evaluate', 'hf://me/bare', '--episodes', '1']))"
+    code = f"observation = [1.0, 0.0, 0.5]\n{lines}\n{shown}\n{played}"
     done = call("-c", code, folder=tmp_path, token="")
-    assert (done.returncode, done.stderr, done.stdout) == (0, "", "(1,) True\n")
-    words = ("-m", "rmc.cli.main", "evaluate", "hf://me/bare", "--episodes", "1")
-    played = call(*words, folder=tmp_path, token="")
-    assert (played.returncode, played.stderr) == (0, "")
-    assert "Pendulum-v1: return" in played.stdout
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("(1,) True\n")
+    assert "Pendulum-v1: return" in done.stdout
+    assert done.stdout.endswith("\n0\n")
 
 
 LOUD = """
@@ -119,6 +119,7 @@ WRONG = [
     (["push", "run", "me/x"], "hf_reads", "REPO='me/x': the hub refuses it (HTTP 401); use a token that may"),
     (["push", "run", "others/x"], TOKEN, "REPO='others/x': the hub refuses it (HTTP 403); use a token that may"),
     (["push", "run", "swings"], TOKEN, "REPO='swings': no repository's name; give owner/name"),
+    (["pull", "swings"], TOKEN, "REPO='swings': no repository's name; give owner/name"),
     (["push", "run", "a/b/c"], TOKEN, "REPO='a/b/c': no repository's name; give owner/name"),
     (
         ["push", "run", "me/x", "--license", "foo"],
@@ -160,7 +161,7 @@ def test_what_goes_wrong_is_one_line(hub: Hub, call: Call, tmp_path: Path) -> No
 
 @pytest.mark.parametrize(
     ("words", "more"),
-    [("push run me/x", {}), ("push run me/x", {"HF_HUB_OFFLINE": "1"}), ("pull x", {"HF_HUB_OFFLINE": "1"})],
+    [("push run me/x", {}), ("push run me/x", {"HF_HUB_OFFLINE": "1"}), ("pull me/x", {"HF_HUB_OFFLINE": "1"})],
 )
 def test_without_a_network_one_line_says_what_was_tried(
     words: str, more: dict[str, str], call: Call, tmp_path: Path

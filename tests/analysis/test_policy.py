@@ -2,8 +2,11 @@
 
 import dataclasses
 import importlib.util
+import itertools
 import json
 import pickle
+import re
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -16,6 +19,7 @@ import numpy as np
 import onnxruntime
 import pytest
 import torch
+from gymnasium.envs.classic_control.pendulum import PendulumEnv
 from safetensors.torch import load, save
 
 from rmc import api
@@ -30,7 +34,7 @@ from rmc.cli import main, policy_commands
 from rmc.common.agent_config import AgentConfig
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.env.config import EnvConfig
-from rmc.common.errors import ConfigError
+from rmc.common.errors import STOPPED_STATUS, ConfigError
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.presets import debug
 from tests.command import complaint
@@ -62,6 +66,7 @@ def test_a_loop_of_ones_own_gives_what_an_evaluation_gives(run: RunFolder) -> No
 @contextmanager
 def torch_of_anothers() -> Iterator[None]:
     """As a program has it that computes in float64, elsewhere."""
+    threads = torch.get_num_threads()
     torch.set_default_dtype(torch.float64)
     torch.set_default_device("meta")
     torch.set_num_threads(2)
@@ -72,6 +77,7 @@ def torch_of_anothers() -> Iterator[None]:
     finally:
         torch.set_default_dtype(torch.float32)
         torch.set_default_device(None)
+        torch.set_num_threads(threads)
 
 
 def test_a_program_with_other_defaults_of_torch_keeps_them(tmp_path: Path) -> None:
@@ -183,6 +189,25 @@ def test_all_probabilities_are_played_by_one_policy(
     assert [json.loads(line)["updates"] for line in capsys.readouterr().out.splitlines()] == [7, 7]
 
 
+@pytest.mark.parametrize("episode", [0, 2])
+def test_an_interrupt_prints_the_episodes_that_are_over(
+    episode: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = make_run(tmp_path / "run", AGENTS["robust"], "Pendulum-v1")
+    steps, step = itertools.count(1), PendulumEnv.step
+
+    def interrupted(env: PendulumEnv, action: Any) -> Any:
+        if next(steps) == 200 * episode + 50:
+            signal.raise_signal(signal.SIGINT)
+        return step(env, action)
+
+    monkeypatch.setattr(PendulumEnv, "step", interrupted)
+    assert main.run(["evaluate", str(run.path), "--episodes", "9", "--flicker", "0", "0.5"]) == STOPPED_STATUS
+    said = capsys.readouterr().out
+    told = r"Pendulum-v1: return \S+ ± \S+ over 2 episodes, cut when it was stopped, after 70 steps\n"
+    assert re.fullmatch(told if episode else "", said)  # and no other flicker is played
+
+
 @pytest.mark.long
 def test_an_evaluation_is_the_same_with_any_number_of_threads(tmp_path: Path) -> None:
     run = make_run(
@@ -234,6 +259,14 @@ def test_what_is_no_observation_is_refused(tmp_path: Path, observations: list[An
 def test_flags_of_several_lengths_are_refused(run: RunFolder) -> None:
     with pytest.raises(ConfigError, match=r"missing=.*: give one, or one for each of 1 rows"):
         load_policy(run.path).act(np.ones(3), [[True], [True, False]])  # type: ignore[arg-type]
+
+
+def test_flags_that_are_text_are_refused(tmp_path: Path) -> None:
+    policy = load_policy(make_run(tmp_path / "run", AGENTS["robust"], "Pendulum-v1").path)
+    words: list[Any] = ["yes", ["False"], b""]
+    for missing in words:
+        with pytest.raises(ConfigError, match=r"^missing=.*: give True or False, not text$"):
+            policy.act(np.ones(3), missing)
 
 
 @pytest.mark.parametrize(("env", "shape"), [("Column-v0", (2, 1)), ("Row-v0", (1, 2))])

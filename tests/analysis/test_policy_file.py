@@ -318,6 +318,21 @@ def test_what_is_no_policy_is_one_line(
     assert not file.with_suffix(".onnx").exists()
 
 
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("policy.onnx", "it is for onnxruntime; give its run, or what rmc export RUN --out policy.safetensors writes"),
+        ("config.json", "no policy's file; give a run's folder or a policy.safetensors"),
+    ],
+)
+def test_a_file_of_another_format_is_not_called_damaged(name: str, says: str, file: Path) -> None:
+    other = file.with_name(name)
+    other.write_bytes(b"\x08\x08 what is no policy")
+    with pytest.raises(ConfigError, match=f"^policy file='{other}': {says}$"):
+        load_policy(other)
+    assert load_policy(file.rename(file.with_suffix(".bak"))).header.env_steps == 70
+
+
 def test_weights_that_are_not_finite_are_refused(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     capsys.readouterr()
     blob = file.read_bytes()

@@ -421,7 +421,7 @@ def test_counters_make_events_that_do_not_repeat(folder: RunFolder) -> None:
     ("words", "message"),
     [
         ([], "RUNS='': give folders of runs"),
-        (["nowhere"], "no config.json there; give the folder of a run"),
+        (["nowhere"], "is not there; give the folder of a run"),
         (["RUN", "--port", "70000"], "--port=70000: take a port from 0 to 65535"),
         (["RUN", "--port", "TAKEN"], "Address already in use on 127.0.0.1; take another, or 0 for a free one"),
         (["RUN", "--host", "no host"], "--host='no host': "),

@@ -132,7 +132,7 @@ def test_a_tilde_is_the_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     untrained(tmp_path / "run", CONFIG)
     with pytest.raises(rmc.ConfigError, match=rf"^--run-dir='{tmp_path}/run': is there already"):
         rmc.train(CONFIG, "~/run", if_exists="fail")
-    with pytest.raises(rmc.ConfigError, match=f"^RUN='{tmp_path}/none': no config.json there"):
+    with pytest.raises(rmc.ConfigError, match=f"^RUN='{tmp_path}/none': is not there; give the folder of a run"):
         rmc.resume("~/none")
     with pytest.raises(rmc.ConfigError, match=f"^RUN='{tmp_path}/none': cannot be read"):
         rmc.evaluate("~/none")
@@ -294,7 +294,8 @@ def test_a_callback_hears_each_record_and_its_error_ends_a_run_that_goes_on(laun
 
     def until_updates(record: dict[str, Any]) -> None:
         heard.append(record)
-        if record["role"] == "learner" and record["updates"] > 10:
+        all_speak = {"actor-0", "replay", "launcher"} <= {one["role"] for one in heard}
+        if record["role"] == "learner" and record["updates"] > 10 and all_speak:
             record.clear()  # its own copy
             raise Enough
 
@@ -306,11 +307,12 @@ def test_a_callback_hears_each_record_and_its_error_ends_a_run_that_goes_on(laun
     assert heard.pop() == {}
     assert [record for record in written if record in heard] == heard
     assert folder.lock.ended() == STOPPED_STATUS
-    steps = written[len(heard)]["env_steps"]
-    heard.clear()
-    result = rmc.resume(tmp_path / "run", total_steps=steps + 300, callback=heard.append)
-    assert result["env_steps"] >= steps
-    assert {"learner", "actor-0", "replay", "launcher"} <= {record["role"] for record in heard}
+    if launcher == "lockstep":  # integration/test_end_to_end.py resumes a run of processes
+        steps = written[len(heard)]["env_steps"]
+        heard.clear()
+        result = rmc.resume(tmp_path / "run", total_steps=steps + 300, callback=heard.append)
+        assert result["env_steps"] >= steps
+        assert {"learner", "actor-0", "replay", "launcher"} <= {record["role"] for record in heard}
 
 
 def test_a_callback_that_is_no_function_is_refused(tmp_path: Path) -> None:

@@ -151,6 +151,8 @@ def test_check_env_train_and_evaluate_say_the_same(
         captured = capsys.readouterr()
         assert says in (captured.err if words[0] != "check-env" else captured.out)
         assert len(captured.err.splitlines()) <= 1
+        more = f"; rmc check-env {run.config().env.id} says more\n"
+        assert captured.err.endswith(more) or words[0] == "check-env"
         assert len(caplog.records) <= 1
 
 

@@ -229,7 +229,7 @@ def test_a_wrong_option_is_one_short_line(words: str, said: str, capsys: pytest.
         ([], "train"),
         (["trian"], "trian"),
         (["train"], "train"),
-        (["train", "--run-dir", "nowhere"], "ENV='': rmc train takes an environment"),
+        (["train", "--run-dir", "nowhere"], "or --run-dir with a run; nowhere holds none"),
         (["resume"], "RUN"),
         (["resume", "nowhere"], "nowhere': is not there"),
         ([*DEBUG, "--init-from", "nowhere"], "--init-from='nowhere': no such run"),

@@ -115,7 +115,7 @@ def test_a_new_folder_beside_it_begins_with_the_preset(run: RunFolder) -> None:
         ),
         (["--preset", "paper"], "--preset='paper': the run in {} has 'debug', and its other options came from that"),
         (["--flicker", "0"], "--flicker=0.0: the run in {} has 0.25, and its experience is from that environment"),
-        (["--total-steps", "400"], "--total-steps=400: take more than --warmup-steps=500"),
+        (["--total-steps", "400"], "--total-steps=400: take more than --warmup-steps=500, which a new run may"),
         (["--device", "tpu"], "--device='tpu'"),
     ],
 )

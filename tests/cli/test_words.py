@@ -80,7 +80,8 @@ def test_a_tilde_is_the_home_where_no_shell_reads_it(file: Path, monkeypatch: py
         ("hidden = { a = 1 }", "hidden=", "give a number"),
         ("hidden = [[1]]", "hidden=", "give a number"),
         ("hidden = ", "agent.toml", "not TOML"),
-        ("hidden = 'many'", "--hidden", "'many' is no whole number"),
+        ("hidden = 'many'", "agent.toml: Error parsing --hidden", "'many' is no whole number"),
+        ("heads = ['a']", "agent.toml: Missing value for argument '--heads'", "2 values"),
         ("hidden = -3", "--hidden=-3", "take"),
     ],
 )

@@ -18,6 +18,7 @@ import yaml
 from rmc import deploy
 from tests.cluster import machines
 from tests.cluster.machines import Machine, Machines
+from tests.integration.running import newest_in
 from tests.integration.test_learning import DATA, FAST, SMALL
 
 pytestmark = [pytest.mark.skipif(bool(machines.missing()), reason=machines.missing()), pytest.mark.timeout(900)]
@@ -110,8 +111,7 @@ class Run:
         return [record for record in records if record["role"] == role]
 
     def newest(self, role: str, name: str, default: Any = 0) -> Any:
-        values = [record[name] for record in self.records(role) if name in record]
-        return values[-1] if values else default
+        return newest_in(self.records(role), name, default)
 
     def heard(self, actors: int) -> float:
         """When the actor spoke last that has been silent for longest."""
@@ -175,7 +175,7 @@ class Run:
         """Nothing went back, and no acknowledged window was lost or asked for twice."""
         steps = [record["env_steps"] for record in self.records("replay")]
         assert steps == sorted(steps)
-        assert self.newest("replay", "entry_gaps") == self.newest("replay", "dead_letters") == 0
+        assert [self.newest("replay", name, None) for name in ("entry_gaps", "dead_letters")] == [0, 0]
 
     def stop(self, words: str = "", machine: Machine | None = None) -> str:
         output = (machine or self.site.head).run(f"{RMC} stop {words or self.folder}").stdout

@@ -109,7 +109,7 @@ def test_two_shards_speak_over_the_network_and_encrypted_where_redis_can(tmp_pat
         assert training.finish(240) == 0, training.text() + training.logs()
     assert json.loads((folder / "result.json").read_text())["env_steps"] == 2_000
     for role in ("replay-0", "replay-1"):
-        assert training.newest(role, "refused_clients") == 0
+        assert training.newest(role, "refused_clients", None) == 0
         assert training.newest(role, "drawn_steps") > 0
 
 
@@ -170,7 +170,7 @@ def test_a_node_is_lost_and_another_comes(nodes: Cluster, tmp_path: Path) -> Non
         training.wait_for_updates(100)
         steps = [record["env_steps"] for record in training.records("replay")]
         assert steps == sorted(steps)
-        assert training.newest("replay", "entry_gaps") == training.newest("replay", "dead_letters") == 0
+        assert [training.newest("replay", name, None) for name in ("entry_gaps", "dead_letters")] == [0, 0]
 
         trainer = RunFolder(folder).lock.trainer()
         assert trainer is not None

@@ -4,7 +4,6 @@ import re
 import shutil
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 from typing import get_args
 
@@ -13,9 +12,7 @@ import pytest
 import rmc
 from rmc.common.extra import how_to_install
 from rmc.deploy.run.tracking import TrackerName
-
-ROOT = Path(__file__).parents[2]
-SOURCES = ("actors", "analysis", "common", "deploy", "learner", "replay_server", "rmc", "Makefile")
+from tests.package import FOLDERS, PYPROJECT, ROOT
 
 
 def test_from_a_checkout() -> None:
@@ -40,10 +37,8 @@ def test_from_a_wheels_files(tmp_path: Path) -> None:
 
 
 def test_every_hint_asks_for_it_and_names_an_extra() -> None:
-    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    paths = [
-        path for name in SOURCES for path in ((ROOT / name).rglob("*.py") if (ROOT / name).is_dir() else [ROOT / name])
-    ]
+    extras = PYPROJECT["project"]["optional-dependencies"]
+    paths = [ROOT / "Makefile", *(path for name in FOLDERS for path in (ROOT / name).rglob("*.py"))]
     texts = {path: path.read_text() for path in paths}
     assert not [str(path) for path, text in texts.items() if re.search(r"""install ['"]?rmc\\?\[""", text)]
     asks = re.compile(r"""(?:how_to_install|check_installed)\(['"]([^'"]*)['"]""")

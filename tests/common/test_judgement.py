@@ -202,6 +202,40 @@ def test_a_file_in_place_of_a_module_comes_with_the_right_name(env: str) -> None
 
 
 @pytest.mark.parametrize(
+    ("path", "name"),
+    [
+        ("pkg/mine", "pkg.mine"),
+        ("./mine", "mine"),
+        ("../pkg/mine", "mine"),
+        ("/home/me/mine", "mine"),
+        ("{here}/pkg/mine", "pkg.mine"),
+        (".mine", "mine"),
+    ],
+)
+def test_a_path_in_place_of_a_module_comes_with_the_right_name(
+    path: str, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "pkg").mkdir()
+    (tmp_path / "pkg" / "mine.py").touch()
+    says = f"give the module's name, not its path: {name}:Mine-v0, from the folder that holds {name.split('.')[0]}"
+    with pytest.raises(ConfigError, match=f"{says}$"):
+        make_env(EnvConfig(f"{path.format(here=tmp_path)}:Mine-v0"))
+
+
+@pytest.mark.parametrize("env", ["mine", "mine.Mine-v0", "./mine.py", "mine.py"])
+def test_a_module_in_place_of_an_id_comes_with_how_to_give_it(
+    env: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match="no such environment; use a gymnasium id or module:EnvId-v0"):
+        make_env(EnvConfig(env))
+    (tmp_path / "mine.py").touch()
+    with pytest.raises(ConfigError, match=r"no such environment; mine\.py is here: give mine:EnvId-v0"):
+        make_env(EnvConfig(env))
+
+
+@pytest.mark.parametrize(
     ("env", "says"),
     [
         ("LateSpaces", "spaces raises AttributeError: 'LateSpaces' object has no attribute 'observation"),

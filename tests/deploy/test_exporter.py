@@ -160,7 +160,8 @@ def test_a_second_start_is_not_told_of_the_port_that_the_first_one_has(
         words = ["resume", str(folder.path), "--metrics-port", str(port)]
         assert main.run(words) == 2
         folder.lock.release()
-    assert capsys.readouterr().err == f"rmc: --run-dir='{folder.path}': this run is being trained; stop it first, or watch it: rmc attach\n"
+    fault = "this run is being trained; stop it first, or watch it: rmc attach"
+    assert capsys.readouterr().err == f"rmc: --run-dir='{folder.path}': {fault}\n"
 
 
 def test_nobodys_name_is_looked_up(status: RunStatus, port: int, monkeypatch: pytest.MonkeyPatch) -> None:

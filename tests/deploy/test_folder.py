@@ -154,6 +154,18 @@ def test_a_disk_without_locks_is_one_line_before_there_is_a_run(
     assert not (tmp_path / "run" / "config.json").exists()
 
 
+@pytest.mark.parametrize("fault", [errno.EROFS, errno.EACCES])
+def test_a_run_that_cannot_be_written_is_to_be_copied(
+    fault: int, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = untrained(tmp_path / "run", debug(EnvConfig("Pendulum-v1")))
+    monkeypatch.setattr("rmc.deploy.run.run_lock.take_lock", raising(fault))
+    line = (
+        f"rmc: RUN='{run.path}': cannot be written ({os.strerror(fault)}); copy the run elsewhere, or make it writable"
+    )
+    assert complaint(["resume", str(run.path), "--device", "cpu"], capsys) == line
+
+
 @pytest.mark.parametrize("fault", [errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK])
 def test_a_copy_on_a_disk_without_locks_can_be_read(
     fault: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -400,6 +412,27 @@ def test_odd_files_are_named_in_one_line(
         line = complaint([*command, str(tmp_path)], capsys)
         assert fault in line
         assert str(tmp_path) in line
+
+
+@pytest.mark.parametrize("command", ["stats", "evaluate", "resume"])
+@pytest.mark.parametrize(
+    ("place", "says"),
+    [
+        ("frist", "did you mean first?"),
+        ("*", "give "),
+        (".", "holds runs; give one of them, as rmc list names them"),
+        ("first/checkpoints/000000333", "is a checkpoint; give its run, first, with --checkpoint 333"),
+        ("first/checkpoints", "no config.json there; give the folder of a run"),
+    ],
+)
+def test_what_is_no_runs_folder_comes_with_what_to_give(
+    place: str, says: str, command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = untrained(tmp_path / "first", debug(EnvConfig("Pendulum-v1")))
+    (run.checkpoints / "000000333").mkdir()
+    line = complaint([command, str(tmp_path / place)], capsys)
+    assert line.startswith(f"rmc: RUN='{tmp_path / place}': ")
+    assert says in line
 
 
 @pytest.mark.parametrize("words", [["stats"], ["resume"], ["stop"], ["train", "Pendulum-v1", "--run-dir"]])

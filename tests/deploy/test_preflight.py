@@ -180,6 +180,8 @@ def test_a_ring_on_another_machine_is_not_judged_by_this_ones_disk(
 ) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=0))
     options = LaunchOptions(tmp_path / "run", "fail")
-    with pytest.raises(ConfigError, match=r"^--capacity=100: takes .*; make room$"):
+    with pytest.raises(
+        ConfigError, match=r"^--capacity=100: takes .* beside 268.4 MB for .*, 0 bytes are free; make room$"
+    ):
         check_machine(run(15, 8), options)
     check_machine(run(15, 8), dataclasses.replace(options, launcher="ray"))

@@ -28,6 +28,7 @@ from rmc.deploy.redis.server import RedisServer
 from rmc.deploy.redis.users import RedisUsers
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.presets import debug
+from tests.waiting import wait_until
 
 
 @pytest.fixture
@@ -43,7 +44,7 @@ def test_a_role_waits_for_a_redis_that_is_coming_back(short: Path, caplog: pytes
         connect(url, "run")
     with ThreadPoolExecutor(1) as pool:
         waiting = pool.submit(connect, url, "run", Deadline(20.0, StopSignal()))
-        time.sleep(0.7)
+        wait_until(lambda: caplog.messages)
         with server:
             waiting.result().ping()
     (message,) = caplog.messages
@@ -78,11 +79,11 @@ def test_a_role_waits_for_its_run(
         later.result()
 
 
-def test_who_is_told_to_stop_waits_no_longer(short: Path) -> None:
+def test_who_is_told_to_stop_waits_no_longer(short: Path, caplog: pytest.LogCaptureFixture) -> None:
     stop = StopSignal()
     with ThreadPoolExecutor(1) as pool:
         waiting = pool.submit(connect, f"unix://{short}/redis.sock", "run", Deadline(60.0, stop))
-        time.sleep(0.3)
+        wait_until(lambda: caplog.messages)
         stop.request()
         with pytest.raises(ConfigError, match="no Redis answers"):
             waiting.result(10.0)

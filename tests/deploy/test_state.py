@@ -11,6 +11,7 @@ from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
 from rmc.deploy.run.state import run_state
+from tests.command import complaint
 
 RESULT = ("env_steps", "updates", "wall_s", "eval_return_mean", "eval_return_std", "eval_episodes")
 
@@ -30,6 +31,20 @@ def test_a_run_is_trained_until_it_ends(folder: RunFolder) -> None:
 def test_any_other_end_is_a_failure(folder: RunFolder, status: int) -> None:
     folder.lock.release(status)
     assert run_state(folder) == "failed"
+
+
+@pytest.mark.parametrize("command", ["evaluate", "doctor", "plot"])
+@pytest.mark.parametrize(
+    ("status", "says"), [(1, "; it failed, and logs/launcher.log says why"), (130, "; train it for longer")]
+)
+def test_a_run_with_too_little_on_record_comes_with_what_helps(
+    folder: RunFolder, status: int, says: str, command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder.logs / "launcher.log").touch()
+    folder.lock.release(status)
+    line = complaint([command, str(folder.path)], capsys)
+    assert line.startswith(f"rmc: RUN{'S' * (command == 'plot')}='{folder.path}': it has ")
+    assert line.endswith(says)
 
 
 def test_a_run_with_a_result_is_finished(folder: RunFolder) -> None:

@@ -1,6 +1,5 @@
 """A run in real trackers: what arrives, that a resume continues it, and that no tracker's trouble is the run's."""
 
-import dataclasses
 import json
 import logging
 import os
@@ -25,6 +24,7 @@ from rmc.deploy.monitor.tracker import Tracker, start_tracker
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.tracking import Tracking, keep_tracking, kept_tracking
 from tests import wandb_file
+from tests.deploy.test_config import with_value
 from tests.processes import alive
 from tests.runs import untrained
 from tests.waiting import wait_until
@@ -80,12 +80,17 @@ def video(path: Path) -> str:
     return str(path)
 
 
-def train_twice(folder: RunFolder, name: str) -> None:
-    """A start that is stopped, and one that finishes, with a video."""
-    for env_steps, end in ((700, {"state": "stopped"}), (1500, {**RESULT, "video": video(folder.path / "video.mp4")})):
-        tracker = started(folder, name)
-        trained(folder, env_steps, env_steps / 100)
-        tracker.close(end)
+def train_once(folder: RunFolder, name: str, env_steps: int, end: dict[str, Any]) -> None:
+    tracker = started(folder, name)
+    trained(folder, env_steps, env_steps / 100)
+    tracker.close(end)
+
+
+def train_twice(folder: RunFolder, name: str, gamma: float = 0.99) -> None:
+    """A start that is stopped, and one that finishes, with a video and that discount."""
+    train_once(folder, name, 700, {"state": "stopped"})
+    folder.write_config(with_value(folder.config(), "update.gamma", gamma))
+    train_once(folder, name, 1500, {**RESULT, "video": video(folder.path / "video.mp4")})
 
 
 def test_wandb_has_the_run_over_its_starts(folder: RunFolder, caplog: pytest.LogCaptureFixture) -> None:
@@ -160,10 +165,7 @@ def test_mlflow_has_the_run_over_its_starts(
     store = f"sqlite:///{tmp_path}/mlflow.db"
     monkeypatch.setenv("MLFLOW_TRACKING_URI", store)
     monkeypatch.chdir(tmp_path)  # where videos go
-    train_twice(folder, "mlflow")
-    config = folder.config()
-    folder.write_config(dataclasses.replace(config, update=dataclasses.replace(config.update, gamma=0.5)))
-    started(folder, "mlflow").close(RESULT)
+    train_twice(folder, "mlflow", gamma=0.5)
     assert not caplog.messages
     client = MlflowClient(store)
     experiment = client.get_experiment_by_name("my-project")

@@ -97,7 +97,8 @@ def test_what_reads_reads_it(old: RunFolder, capsys: pytest.CaptureFixture[str])
 @the_rest_at_length
 def test_what_exports_and_draws_reads_it(old: RunFolder) -> None:
     before = (old.path / "config.json").read_bytes()
-    assert main.run(["export", str(old.path), "--out", str(old.path / "policy.onnx")]) == 0
+    suffix = "onnx" if old.path.name == FORMATS[0] else "safetensors"  # ONNX takes seconds, and all are alike by then
+    assert main.run(["export", str(old.path), "--out", str(old.path / f"policy.{suffix}")]) == 0
     assert main.run(["inspect", str(old.path), "--out", str(old.path / "inspect.png")]) == 0
     assert main.run(["plot", str(old.path), "--out", str(old.path / "curves.png")]) == 0
     assert (old.path / "config.json").read_bytes() == before

@@ -5,10 +5,10 @@ two processes, which look as a raylet and its agent do.
 """
 
 import os
+import shutil
 import signal
 import socket
 import subprocess
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -32,6 +32,10 @@ else
 fi
 exit ${{STATUS:-0}}
 """
+TIMEOUT = """#!/bin/bash
+echo >> {folder}/looks
+exec {timeout} "$@"
+"""
 LIFE = """trap 'echo >> {folder}/ended-in-order; exit' TERM
 exec 3<> {folder}/never
 while true; do read -t 0.1 <&3; done
@@ -39,12 +43,17 @@ while true; do read -t 0.1 <&3; done
 
 
 class Worker:
-    """A machine's home folder with such a ``ray``, and a head that answers while ``head`` is there."""
+    """A machine's home folder with such a ``ray``, and a head that answers while ``head`` is there.
+
+    By ``timeout`` the script looks whether it answers, which is noted.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         (folder / "ray").write_text(RAY.format(folder=folder))
-        (folder / "ray").chmod(0o755)
+        (folder / "timeout").write_text(TIMEOUT.format(folder=folder, timeout=shutil.which("timeout")))
+        for name in ("ray", "timeout"):
+            (folder / name).chmod(0o755)
         os.mkfifo(folder / "never")
         (folder / "life").write_text(LIFE.format(folder=folder))
         self.head = socket.create_server(("127.0.0.1", 0))
@@ -52,6 +61,7 @@ class Worker:
 
     def run(self, *words: str, status: int = 0) -> int:
         environment = os.environ | {"HOME": str(self.folder), "HEAD": self.address, "STATUS": str(status)}
+        environment["PATH"] = f"{self.folder}:{environment['PATH']}"
         return subprocess.run([SCRIPT, self.folder / "ray", *words], env=environment, timeout=20).returncode
 
     def start(self, *options: str, status: int = 0) -> int:
@@ -60,6 +70,11 @@ class Worker:
     def processes(self, name: str) -> list[int]:
         """Those of this folder whose words have this in them."""
         return [one.pid for one in matching(rf"{self.folder}.*{name}|{name}.*{self.folder}", psutil.process_iter())]
+
+    def looks(self) -> int:
+        """How often it has asked the head."""
+        path = self.folder / "looks"
+        return len(path.read_text()) if path.exists() else 0
 
     def calls(self, action: str) -> int:
         return sum(line.startswith(action) for line in (self.folder / "calls").read_text().splitlines())
@@ -80,7 +95,8 @@ def test_it_is_started_again_once_the_head_answers(worker: Worker) -> None:
     worker.head.close()
     os.kill(raylet, signal.SIGKILL)
     wait_until(lambda: not worker.processes("--gcs-address"))  # what it left is ended, too
-    time.sleep(1.0)
+    looks = worker.looks()
+    wait_until(lambda: worker.looks() >= looks + 2)  # of which the first was in vain
     assert worker.calls("start") == 1
     worker.head = socket.create_server(("127.0.0.1", int(worker.address.rpartition(":")[2])))
     wait_until(lambda: worker.calls("start") == 2)
@@ -103,8 +119,7 @@ def test_stop_ends_all_and_the_raylet_in_order(worker: Worker) -> None:
     worker.start()
     worker.run("stop", "--force")
     assert (worker.folder / "ended-in-order").read_text() == "\n"
-    assert worker.processes("") == []
-    time.sleep(1.5)
+    assert worker.processes("") == []  # so that nobody starts it again
     assert worker.calls("start") == 1
 
 

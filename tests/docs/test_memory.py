@@ -7,8 +7,9 @@ from typing import get_args, get_type_hints
 import pytest
 
 from rmc.actors.config import ActorConfig
-from rmc.deploy.local import trial
+from rmc.cli import dry_run
 from rmc.deploy.run.config import WindowConfig
+from tests.cli.test_dry_run import MEASURED
 from tests.docs.running import DOCS, LOCKSTEP, commands, ran
 
 PAGE = (DOCS / "memory.md").read_text()
@@ -16,7 +17,7 @@ SHORT = ("--preset", "debug", *LOCKSTEP, "--total-steps", "600")
 
 
 def test_its_commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(trial, "TRAINED_SECONDS", 2.0)
+    monkeypatch.setattr(dry_run, "run_trial", lambda *_: MEASURED)
     printed = commands(PAGE)
     assert [words[0] for words in printed] == ["check-env", "train", "train", "inspect"]
     outputs = [ran(tmp_path, *words, *(SHORT if "--run-dir" in words else ())) for words in printed]

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from rmc.analysis.policy import load_policy
-from tests.analysis.hub_stub import TOKEN, Hub
+from tests.analysis.hub_stub import Hub
 from tests.docs.running import DOCS, LOCKSTEP, commands, ran
 
 POLICY, HUB = (DOCS / "policy.md").read_text(), (DOCS / "hub.md").read_text()
@@ -50,7 +50,7 @@ def test_the_pages_run(tmp_path: Path) -> None:
 
 def _share(folder: Path) -> None:
     hub = Hub()
-    named = {"HF_ENDPOINT": hub.url, "HF_HOME": str(folder / "home"), "HF_TOKEN": TOKEN, "HF_HUB_DISABLE_XET": "1"}
+    named = hub.environment(folder / "home")
     try:
         push, pull = (python("-m", "rmc.cli.main", *command, folder=folder, **named) for command in commands(HUB))
         (code,) = re.findall(r"```python\n(.*?)```", HUB, re.DOTALL)

@@ -13,6 +13,7 @@ from tests.faults.row import Row, at_length
 SETTLED_SECONDS = 1800.0  # from then on nothing may grow: Redis needs 20 minutes; of a shorter soak the second half
 MOST_GROWTH, RATIO, RATIO_TOLERANCE = 0.02, 4.0, 0.02
 LOOK_SECONDS = 5.0
+FEW_LOOKS = 3  # at either end of a short soak: a file may just be open for being written
 Looks = list[dict[str, tuple[float, int]]]
 
 
@@ -25,13 +26,19 @@ def soak(minutes: int, folder: Path) -> Iterator[Row]:
 
 
 def soaked(
-    run: Loaded, seconds: float, settled: float, most_growth: float = MOST_GROWTH, off: float = RATIO_TOLERANCE
+    run: Loaded,
+    seconds: float,
+    settled: float,
+    most_growth: float = MOST_GROWTH,
+    off: float = RATIO_TOLERANCE,
+    every: float = LOOK_SECONDS,
 ) -> Row:
     """Whether memory and open files stay as they are after ``settled`` seconds, the ring full and the ratio held.
 
     ``off``: how far it may be, as a share; soon after the start what actors may hold back is more of it.
+    ``every``: seconds between looks.
     """
-    looks = watch(run, seconds, settled)
+    looks = watch(run, seconds, settled, every)
     growth, files = memory_growth(looks), max(files_growth(looks).values())
     ratio, full = run.newest("replay", "replay_ratio"), run.newest("replay", "ring_fill") == 1.0
     passed = max(growth.values()) < most_growth and files <= 0 and full and abs(ratio / RATIO - 1) < off
@@ -40,13 +47,13 @@ def soaked(
     return Row(f"soak, {seconds / 60:.0f} minutes", 1, passed, found=facts)
 
 
-def watch(run: Loaded, seconds: float, settled: float) -> Looks:
-    """Looks at what is held, from ``settled`` on."""
+def watch(run: Loaded, seconds: float, settled: float, every: float) -> Looks:
+    """Looks at what is held, from ``settled`` to the end; on a slow machine on until there are enough."""
     time.sleep(settled)
-    looks, end = Looks(), time.monotonic() + seconds - settled
-    while time.monotonic() < end:
+    end, looks = time.monotonic() + seconds - settled, [run.held()]
+    while (left := end - time.monotonic()) > 0 or len(looks) < 2 * FEW_LOOKS:
+        time.sleep(left if 0 < left < every else every)
         looks.append(run.held())
-        time.sleep(LOOK_SECONDS)
     return looks
 
 
@@ -63,7 +70,8 @@ def memory_growth(looks: Looks) -> dict[str, float]:
 
 def files_growth(looks: Looks) -> dict[str, int]:
     """By role: fewest files open in the last tenth, less the fewest in the first."""
-    few = max(3, len(looks) // 10)  # in a short soak, too, more than one: a file may just be open for being written
+    few = max(FEW_LOOKS, len(looks) // 10)
+    assert len(looks) >= 2 * few, "the first looks are the last ones, too"
     fewest = [{role: min(look[role][1] for look in part) for role in looks[0]} for part in (looks[:few], looks[-few:])]
     return {role: fewest[1][role] - fewest[0][role] for role in looks[0]}
 

@@ -208,7 +208,7 @@ def updates_in(run: Loaded, seconds: float) -> int:
 
 
 def test_a_full_ring_wraps(full: Loaded) -> None:
-    row = soaked(full, 10.0, 2.0, MOST_GROWTH, EARLY_RATIO)
+    row = soaked(full, 8.0, 2.0, MOST_GROWTH, EARLY_RATIO, every=1.0)
     assert row.passed, row
 
 

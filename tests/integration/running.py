@@ -42,6 +42,11 @@ def records_of(run: Path, role: str) -> list[dict[str, Any]]:
     return [record for record in records if record["role"] == role]
 
 
+def newest_in(records: list[dict[str, Any]], name: str, default: Any) -> Any:
+    """The newest value of a metric; the default where nobody has said it."""
+    return next((record[name] for record in reversed(records) if name in record), default)
+
+
 class Command:
     """``rmc``, started at once; ``close`` kills what is left of it."""
 
@@ -121,8 +126,7 @@ class Training(Command):
 
     def newest(self, role: str, name: str, default: Any = 0) -> Any:
         """The newest value of a metric."""
-        values = [record[name] for record in self.records(role) if name in record]
-        return values[-1] if values else default
+        return newest_in(self.records(role), name, default)
 
     def role(self, name: str) -> psutil.Process | None:
         """A role's process; the role's name is ``actor``, ``replay``, ``learner``, ``evaluator`` or ``redis``."""

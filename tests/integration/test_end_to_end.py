@@ -48,7 +48,7 @@ def test_every_metric_is_in_the_glossary(finished: Training) -> None:
 
 def test_train_evaluate_stats_and_resume(finished: Training) -> None:
     training, folder = finished, finished.folder
-    restarts = training.newest("launcher", "restarts")
+    restarts = training.newest("launcher", "restarts", None)
     result = json.loads((folder / "result.json").read_bytes())
     assert result.keys() >= RESULT_KEYS
     assert (result["env"], result["preset"], result["seed"]) == ("InvertedPendulum-v5", "debug", 0)

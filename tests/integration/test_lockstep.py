@@ -124,7 +124,9 @@ def test_batches_that_are_cut_give_the_same_bits_across_a_stop(tmp_path, monkeyp
 
     monkeypatch.setattr(JointUpdate, "plan", plan)
     actor = dataclasses.replace(CONFIG.actor, state_strategy="episode")
-    config = dataclasses.replace(CONFIG, env=EnvConfig("InvertedPendulum-v5", time_limit=100), actor=actor)
+    config = dataclasses.replace(
+        CONFIG, env=EnvConfig("InvertedPendulum-v5", time_limit=100), actor=actor, total_steps=1_000
+    )
     straight = trained(config, tmp_path / "straight")
     stopped = trained(config, tmp_path / "stopped", stop_after_checkpoints=1)
     assert 1 < stopped.learner.updates < straight.learner.updates

@@ -26,7 +26,7 @@ def test_neither_ends_the_run_or_a_role(tmp_path: Path) -> None:
         training.wait_for_updates()
         _stand_still(server, 4 * ENV_TIMEOUT)
         training.wait_for_updates(100)
-        assert training.newest("launcher", "restarts") == 0
+        assert training.newest("launcher", "restarts", None) == 0
         server.close()
         server.start()
         actor = training.role("actor")
@@ -55,7 +55,7 @@ def test_answers_that_pass_are_waited_out_and_one_that_does_not_names_its_key(tm
         time.sleep(4.0)
         client.replicaof("NO", "ONE")
         training.wait_for_updates(100)
-        assert training.newest("launcher", "restarts") == 0, training.logs()
+        assert training.newest("launcher", "restarts", None) == 0, training.logs()
         (acks,) = client.keys("rmc:*:acks")
         client.pipeline().delete(acks).rpush(acks, "a list").execute()
         training.finish(30)

@@ -1,93 +1,23 @@
-"""What a real run leaves or shows, searched for every password of its Redis and for its secret."""
+"""What a run in a Redis of the user's own leaves or shows, searched for that one's password and for its secret.
+
+``test_faults.py`` searches that of an embedded Redis.
+"""
 
 import subprocess
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
-import psutil
-
 from rmc.deploy.redis.server import server_binary
-from rmc.deploy.redis.users import LAUNCHER, RedisUsers
 from rmc.deploy.run.folder import RunFolder
-from tests.integration.running import Training
 from tests.integration.telling_env import TELLS
+from tests.integration.watched import Watched, check_all_was_searched, holding
 
 TELLING, PLAYERS = "tests.integration.telling_env:Telling-v0", ("actor", "evaluator")  # beside the launcher
-COMMANDS = ("main train", "main role actor", "main role evaluator", "main role learner", "main role replay")
 ENDLESS = ("--total-steps", "100000000", "--checkpoint-steps", "500")
 PASSWORD = "hunter2-of-the-users-own-redis"
-
-
-class Watched(Training):
-    """Keeps the command lines of all its processes and what stands beside its sockets, whenever it is waited for."""
-
-    def look(self) -> None:
-        """Once."""
-        self.seen: dict[str, bytes] = getattr(self, "seen", {})
-        for process in [self.launcher, *self.launcher.children(recursive=True)]:
-            with suppress(psutil.NoSuchProcess):
-                words = " ".join(process.cmdline())
-                self.seen[words] = words.encode()
-        for path in self.sockets():
-            if path.is_file():
-                self.seen[str(path)] = path.read_bytes()
-
-    def go_on(self, updates: int) -> None:
-        """So many updates more, and on until every process was seen."""
-        goal = self.newest("learner", "updates") + updates
-        self.wait_for(lambda: (self.look(), self.newest("learner", "updates") >= goal and not self.unseen())[1])
-
-    def unseen(self) -> list[str]:
-        """Processes whose command lines were not."""
-        return [command for command in COMMANDS if not any(command in name for name in self.seen)]
-
-    def lose_redis(self) -> None:
-        """Until a role tells of it: one that comes back within a retry is not noticed."""
-        for _ in range(5):
-            redis = self.role("redis")
-            assert redis is not None
-            redis.kill()
-            self.go_on(20)
-            if "Redis is back" in self.text() + self.logs():
-                return
-        raise AssertionError(f"no role tells of a lost Redis:\n{self.logs()}")
-
-    def left(self) -> dict[str, bytes]:
-        """All that was seen, all that it printed, and every file in its folder."""
-        files = {str(path): path.read_bytes() for path in (self.output, *self.folder.rglob("*")) if path.is_file()}
-        return self.seen | files
-
-
-def holding(left: dict[str, bytes], words: set[bytes]) -> set[str]:
-    """Where one of these words stands."""
-    return {name for name, content in left.items() if any(word in content for word in words)}
-
-
-def check_all_was_searched(left: dict[str, bytes], folder: Path) -> None:
-    """Every kind of what a run leaves or shows was among it."""
-    for name in ("config.json", "metrics.jsonl", "logs/learner.log", "logs/actor-0.log", "logs/evaluator.log"):
-        assert str(folder / name) in left
-    for part in ("events.out.tfevents", "checkpoints/", ".out", *COMMANDS):
-        assert any(part in name for name in left), part
-
-
-def test_passwords_and_secret_of_an_embedded_redis_are_nowhere(tmp_path: Path) -> None:
-    """Nor after it was killed, of which all roles tell; the secret stands in its own file."""
-    with Watched(tmp_path / "run", *ENDLESS) as training:
-        training.go_on(1)
-        training.lose_redis()
-        training.interrupt()
-    run = RunFolder(training.folder)
-    users = RedisUsers(run.name, run.secret(), run.config().roles())
-    passwords = {users.password(user).encode() for user in (LAUNCHER, *users.roles)}
-    left = training.left()
-    check_all_was_searched(left, training.folder)
-    assert any(name.endswith("users.acl") for name in left)
-    assert holding(left, passwords) == set()
-    assert holding(left, {run.secret()}) == {str(run.secret_file)}
 
 
 @contextmanager

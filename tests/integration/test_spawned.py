@@ -55,16 +55,40 @@ def started(place: Path) -> Spawner:
     return Spawner(place / "run", *ENDLESS, env=SPAWNING, environment={SPAWNED: str(place / "told")})
 
 
-@pytest.fixture
-def training(tmp_path: Path) -> Iterator[Spawner]:
-    (tmp_path / "told").mkdir()
-    with started(tmp_path) as run:
+@pytest.fixture(autouse=True)
+def leaves_nothing_behind() -> None:
+    """Not after each of these tests, which share two runs: each looks itself."""
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("spawned")
+    (folder / "told").mkdir()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def training(place: Path) -> Iterator[Spawner]:
+    """A run; the tests below use it and ``again`` in their order."""
+    with started(place) as run:
         run.wait_for_updates()
         yield run
-        run.process.kill()
-        run.process.wait()
-        end_all(run)
-        sweep(Path(tempfile.gettempdir()))
+        until_ended(run)
+
+
+@pytest.fixture(scope="module")
+def again(place: Path, training: Spawner) -> Iterator[Spawner]:
+    """The same run, after its launcher was killed."""
+    with started(place) as run:
+        yield run
+        until_ended(run)
+
+
+def until_ended(run: Spawner) -> None:
+    run.process.kill()
+    run.process.wait()
+    end_all(run)
+    sweep(Path(tempfile.gettempdir()))
 
 
 def end_all(run: Spawner) -> None:
@@ -75,26 +99,19 @@ def end_all(run: Spawner) -> None:
             one.kill()
 
 
-def test_they_end_with_a_role_that_is_killed_or_hangs_and_with_the_run(training: Spawner) -> None:
-    actor, evaluator = training.pid_of("actor"), training.pid_of("evaluator")
-    theirs = len(training.simulators(evaluator))
-    assert len(training.simulators(actor)) >= 3
-    psutil.Process(actor).kill()
-    training.wait_for(lambda: not training.simulators(actor), 5.0)
-    assert len(training.simulators(evaluator)) == theirs >= 3  # which plays on
-
-    training.wait_for(lambda: (role := training.role("actor")) is not None and role.pid != actor)
-    again = training.pid_of("actor")
-    (training.notes / f"hang-{again}").touch()
-    training.wait_for(lambda: not psutil.pid_exists(again), 20.0)
-    training.wait_for(lambda: not training.simulators(again), 5.0)
-
+def test_those_of_a_group_end_where_the_fork_server_is_killed(training: Spawner) -> None:
+    """And the run goes on."""
+    players = [psutil.Process(training.pid_of(name)) for name in ("actor", "evaluator")]
+    own = training.simulators(players[0].pid)
+    training.fork_server().kill()
+    training.wait_for(lambda: not alive(own[:1]), 5.0)
+    training.wait_for(lambda: not alive(players))
+    for left in [one for player in players for one in training.simulators(player.pid)]:  # these have left the group
+        left.kill()
     training.pid_of("actor")
-    training.interrupt()
-    assert training.simulators() == []
 
 
-def test_everything_ends_where_the_launcher_is_killed(training: Spawner) -> None:
+def test_everything_ends_where_the_launcher_is_killed(training: Spawner, request: pytest.FixtureRequest) -> None:
     """And what that leaves is swept by the next start."""
     training.pid_of("actor")
     assert training.simulators()
@@ -106,22 +123,28 @@ def test_everything_ends_where_the_launcher_is_killed(training: Spawner) -> None
     fork_server.wait(5.0)  # which has ended them
     assert psutil.wait_procs(processes, 5.0)[1] == []
     assert [path for path in sockets if path.exists()]
-    with started(training.folder.parent) as again:
-        again.wait_for(lambda: again.role("replay") is not None)
-        assert not [path for path in sockets if path.exists()]
-        again.interrupt()
+    again = request.getfixturevalue("again")
+    again.wait_for(lambda: again.role("replay") is not None)
+    assert not [path for path in sockets if path.exists()]
 
 
-def test_those_of_a_group_end_where_the_fork_server_is_killed(training: Spawner) -> None:
-    actor = training.pid_of("actor")
-    own = training.simulators(actor)
-    training.fork_server().kill()
-    training.wait_for(lambda: not alive(own[:1]), 5.0)
-    for left in alive(own):  # these have left the group
-        left.kill()
-    training.interrupt()
-    for left in training.simulators():
-        left.kill()
+def test_they_end_with_a_role_that_is_killed_or_hangs_and_with_the_run(again: Spawner) -> None:
+    actor, evaluator = again.pid_of("actor"), again.pid_of("evaluator")
+    theirs = len(again.simulators(evaluator))
+    assert len(again.simulators(actor)) >= 3
+    psutil.Process(actor).kill()
+    again.wait_for(lambda: not again.simulators(actor), 5.0)
+    assert len(again.simulators(evaluator)) == theirs >= 3  # which plays on
+
+    again.wait_for(lambda: (role := again.role("actor")) is not None and role.pid != actor)
+    new = again.pid_of("actor")
+    (again.notes / f"hang-{new}").touch()
+    again.wait_for(lambda: not psutil.pid_exists(new), 20.0)
+    again.wait_for(lambda: not again.simulators(new), 5.0)
+
+    again.pid_of("actor")
+    again.interrupt()
+    assert again.simulators() == []
 
 
 def checked(tmp_path: Path, *words: str) -> tuple[subprocess.Popen[bytes], list[psutil.Process]]:

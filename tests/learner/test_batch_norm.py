@@ -13,6 +13,7 @@ from rmc.common.critic import MOMENTUM, VARIANCE_EPS, BatchNorm, TwinQ
 from rmc.learner.config import UpdateConfig
 from rmc.learner.fused import fuse
 from rmc.learner.update_order import make_update
+from tests.learner.agents import distance
 from tests.learner.rows import SPEC, random_rows, to_batch
 
 B, T, Z, A = 16, 15, 24, 2
@@ -54,10 +55,6 @@ def values_and_gradients(made: Agent, given: bool, low: bool) -> dict[str, Tenso
     return {"q": (q * mask).detach(), "features": features.grad, "action": action.grad} | named  # type: ignore[dict-item]
 
 
-def distance(actual: dict[str, Tensor], expected: dict[str, Tensor]) -> dict[str, float]:
-    return {name: float((actual[name] - value).norm() / value.norm()) for name, value in expected.items()}
-
-
 def test_where_all_rows_are_real_it_is_torchs_batch_norm() -> None:
     x = torch.randn(1, 30, 4).mul(3.0).add(1.0).requires_grad_()
     ours, theirs = (
@@ -66,12 +63,8 @@ def test_where_all_rows_are_real_it_is_torchs_batch_norm() -> None:
     )
     expected, actual = theirs(x[0]), ours(x, torch.full((30,), 1 / 30))
     torch.testing.assert_close(actual[0], expected)
-    for out in (expected, actual[0]):
-        x.grad = None
-        (out * torch.arange(4.0)).square().sum().backward()
-        grad, before = x.grad, locals().get("grad")
-        if before is not None:
-            torch.testing.assert_close(grad, before)
+    grads = [torch.autograd.grad((out * torch.arange(4.0)).square().sum(), x)[0] for out in (expected, actual[0])]
+    torch.testing.assert_close(*grads)
     assert theirs.running_mean is not None
     torch.testing.assert_close(ours.mean[0, 0], theirs.running_mean)
     theirs.running_var = ours.variance[0, 0]  # torch's has N - 1 there

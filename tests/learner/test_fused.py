@@ -16,6 +16,7 @@ from rmc.learner.config import UpdateConfig
 from rmc.learner.fused import FusedGRU, fuse
 from rmc.learner.fused_heads import FusedHead, FusedTwinQ
 from rmc.learner.update_order import make_update
+from tests.learner.agents import distance
 from tests.learner.rows import SPEC, random_rows, to_batch
 
 B, T = 6, 5
@@ -90,10 +91,6 @@ def everything(agent, part, low):
     module = getattr(agent, part)
     named = {name: p.grad for name, p in module.named_parameters() if p.grad is not None}
     return {"out": out.detach(), **{f"input {k}": x.grad for k, x in enumerate(inputs)}, **named}
-
-
-def distance(actual, expected):
-    return {name: float((actual[name] - value).norm() / value.norm()) for name, value in expected.items()}
 
 
 @pytest.mark.parametrize("part", CASES)

@@ -6,14 +6,13 @@ import re
 import shutil
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 
 import pytest
 
+from tests.package import FOLDERS, ROOT
 from tests.packaging.container import Image, kept, steps
 
-ROOT = Path(__file__).parents[2]
 DOCKERFILE = (ROOT / "Dockerfile").read_text()
 STRANGER = 4242  # a user number that no system file names
 FOLDER = "/mnt"
@@ -24,9 +23,7 @@ CHROOT = pytest.mark.skipif(not MAY_MOUNT, reason="wants root that may mount, an
 
 
 def test_the_image_gets_what_the_package_is_made_of() -> None:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    folders = set(project["tool"]["setuptools"]["package-dir"].values())
-    assert kept(ROOT) == folders | {"Dockerfile", "constraints.txt", "pyproject.toml", "README.md", "LICENSE"}
+    assert kept(ROOT) == {*FOLDERS, "Dockerfile", "constraints.txt", "pyproject.toml", "README.md", "LICENSE"}
     assert all((ROOT / name).exists() for name in kept(ROOT))
 
 

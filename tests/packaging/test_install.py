@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
+from tests.package import FOLDERS, ROOT
+
 LIBRARIES = site.getsitepackages()[0]  # what the package needs; its own editable install is not taken along
-SOURCES = ("actors", "analysis", "common", "deploy", "learner", "replay_server", "rmc")
 ENVIRONMENT = """
 import gymnasium as gym
 import numpy as np
@@ -49,7 +49,7 @@ print(load_policy("run").act([0.0, 0.0]).shape, rmc.common.errors.__file__)
 def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy of the checkout; of what was built in it, numba's code alone comes along."""
     copy = tmp_path_factory.mktemp("sources")
-    for name in SOURCES:
+    for name in FOLDERS:
         shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("*.pyc"))
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, copy)

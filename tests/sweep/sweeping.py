@@ -19,8 +19,8 @@ ENDLESS = {"total_steps": 10_000_000, "replay_ratio": 8.0}
 
 
 def write_spec(folder: Path, tables: str = "", seeds: Sequence[int] = (0,), **options: Any) -> Path:
-    """A SPEC.toml of tiny runs, with these options beside or in place of theirs."""
-    lines = [f"{name} = {json.dumps(value)}" for name, value in {**TINY, **options}.items()]
+    """A SPEC.toml of tiny runs, with these options beside or in place of theirs; without those that are None."""
+    lines = [f"{name} = {json.dumps(value)}" for name, value in {**TINY, **options}.items() if value is not None]
     path = folder / "spec.toml"
     path.write_text("\n".join([f'env = "{PENDULUM}"', f"seeds = {list(seeds)}", "[options]", *lines, tables]))
     return path

@@ -186,6 +186,7 @@ def test_a_range_is_of_numbers(tmp_path: Path, index: Index) -> None:
         work_of(tmp_path, index, spec)
 
 
+@pytest.mark.long  # tests/docs/test_sweeps.py runs one, too
 def test_a_search_runs_its_trials(tmp_path: Path) -> None:
     folder, spec = tmp_path / "sweep", str(write_spec(tmp_path, TABLE))
     with Sweeping(folder, spec, "--drop-replay") as sweep:

@@ -81,6 +81,7 @@ def test_a_search_has_ranges_and_choices() -> None:
     choices = spec_of(PENDULUM, "--search", "init_from=../a,../b").search
     assert choices is not None
     assert choices.ranges == {"init_from": ["../a", "../b"]}
+    assert read_ranges(["latent_target=ema", "gamma=0.9"]) == {"latent_target": ["ema"], "gamma": [0.9]}
 
 
 def test_a_tracker_is_of_every_run(tmp_path: Path) -> None:
@@ -179,6 +180,10 @@ def test_an_option_that_a_table_names_twice_is_refused(table: str, tmp_path: Pat
         ([PENDULUM, "--grid", "scheme=1", "scheme=2"], "has an option twice"),
         ([PENDULUM, "--grid", "scheme=1,3", "--grid", "n_step=1,2"], "--grid='--grid --grid': is there twice"),
         ([PENDULUM, "--search", "scheme=1,3", "--search=n_step=1..2"], "is there twice; give all of NAME=VALUE"),
+        (
+            [PENDULUM, "--search", "learning_rate=1e-4-1e-2"],
+            "search.learning_rate='1e-4-1e-2': write LOW..HIGH, LOW..HIGH:log, or choices with commas between",
+        ),
         ([PENDULUM, "--search", "scheme=1,1,3"], "search.scheme=[1, 1, 3]: has a value twice"),
         (
             [PENDULUM, "--grid", "heads=64,64"],

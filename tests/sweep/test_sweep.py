@@ -18,9 +18,10 @@ from rich.console import Console
 from rmc.cli import parser
 from rmc.cli.main import run
 from rmc.cli.sweep_check import Checked, as_planned, check_jobs, check_values, read_job
-from rmc.cli.sweep_command import grid_work, read_sweep
+from rmc.cli.sweep_command import _count, grid_work, read_sweep
 from rmc.common.errors import ConfigError
 from rmc.common.process.role import StopSignal
+from rmc.common.return_text import return_text
 from rmc.deploy.run import config as run_config
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
@@ -30,7 +31,7 @@ from rmc.sweep.grid import grid_jobs, is_finished
 from rmc.sweep.index import Index
 from rmc.sweep.job import Job
 from rmc.sweep.pool import drop_replay
-from rmc.sweep.table import result_table
+from rmc.sweep.table import result_table, run_line
 from tests.command import complaint
 from tests.processes import alive
 from tests.runs import untrained
@@ -47,7 +48,7 @@ def test_a_grid_is_run_once_and_told(tmp_path: Path, capsys: pytest.CaptureFixtu
     with Sweeping(folder, str(spec), "--drop-replay") as sweep:
         assert sweep.finish() == 0, sweep.text()
         lines, text = sweep.lines(), sweep.text()
-    assert text.startswith(f"2 runs in {folder}, 0 of them over; {min(2, room.cores())} at a time")
+    assert text.startswith(f"2 runs in {folder}, 0 over; {min(2, room.cores())} at a time")
     events = re.findall(
         r"^([12] of 2): learning_rate \S+, seed 0: return \S+ after 70[01] steps, \d+ s$", text, re.MULTILINE
     )
@@ -65,7 +66,7 @@ def test_a_grid_is_run_once_and_told(tmp_path: Path, capsys: pytest.CaptureFixtu
         assert not (folder / name / "replay").exists()
     best = max(lines.values(), key=lambda line: line["return"])
     first_row = text.splitlines()[-2].split()
-    assert first_row == [f"{best['values']['learning_rate']:.4g}", "1", f"{best['return']:,.1f}"]
+    assert first_row == [f"{best['values']['learning_rate']:.4g}", "1", return_text(best["return"])]
 
     before = {name: (folder / name / "metrics.jsonl").stat().st_mtime_ns for name in runs}
     assert run(["sweep", str(spec), "--sweep-dir", str(folder)]) == 0  # nothing is left to do
@@ -131,19 +132,22 @@ def test_a_run_that_fails_is_told_with_its_last_words(tmp_path: Path) -> None:
 
 
 def test_ctrl_c_ends_all_in_order_and_a_kill_leaves_nothing(tmp_path: Path) -> None:
-    spec, folder = write_spec(tmp_path, seeds=(1, 2, 3), **ENDLESS, launcher="local"), tmp_path / "sweep"
+    """Of a run that has roles, and of one that has none."""
+    both = '[grid]\nlauncher = ["local", "lockstep"]\n'
+    spec, folder = write_spec(tmp_path, both, seeds=SEEDS, **ENDLESS, launcher=None), tmp_path / "sweep"
+    first, later = ([f"launcher={one},seed={seed}" for one in ("local", "lockstep")] for seed in SEEDS)
     words = [str(spec), "--jobs", "2"]
     with Sweeping(folder, *words) as sweep:
-        sweep.wait_for_updates(*OTHERS)
+        sweep.wait_for_updates(*first)
         processes = psutil.Process(sweep.process.pid).children(recursive=True)
         assert sweep.interrupt() == 130
         assert not alive(processes)
-        assert sweep.states() == {"seed=1": "stopped", "seed=2": "stopped", "seed=3": "waiting"}
-    for name in OTHERS:
+        assert sweep.states() == dict.fromkeys(first, "stopped") | dict.fromkeys(later, "waiting")
+    for name in first:
         assert RunFolder(folder / name).lock.ended() == 130  # it has saved
         assert max((folder / name / "checkpoints").glob("[0-9]*")).is_dir()
     with Sweeping(folder, *words) as sweep:
-        sweep.wait_for(lambda: all(sweep.run_process(name) for name in OTHERS))
+        sweep.wait_for(lambda: all(sweep.run_process(name) for name in first))
         processes = psutil.Process(sweep.process.pid).children(recursive=True)
         assert len(processes) >= 2
         sweep.process.kill()
@@ -286,14 +290,20 @@ def test_an_index_whose_values_are_none_is_refused(tmp_path: Path) -> None:
         Index(tmp_path)
 
 
+def test_one_run_on_one_core_is_told_as_one() -> None:
+    assert [_count(1, "run"), _count(2, "run"), _count(1, "core")] == ["1 run", "2 runs", "1 core"]
+
+
 def test_seeds_deviate_as_a_sample_does(tmp_path: Path) -> None:
     jobs = [Job(tmp_path / str(seed), (), seed, {"gamma": 0.99}) for seed in range(2)]
     with closing(Index(tmp_path)) as index:
         for job in jobs:
             index.put(job, "finished")
-            index.lines[job.name]["return"] = 10.0 * job.seed
+            index.lines[job.name] |= {"return": 0.46 + 0.08 * job.seed, "env_steps": 600, "seconds": 3.0}
+        words = [run_line(job, index) for job in jobs]
         (cell,) = next(column.cells for column in result_table(jobs, index).columns if column.header == "return")
-    assert cell == "5.0 ± 7.1"
+    assert cell == "0.5000 ± 0.0566"
+    assert [line.partition(" after")[0].partition(": ")[2] for line in words] == ["return 0.46", "return 0.54"]
 
 
 def test_a_trials_values_stand_under_their_names(tmp_path: Path) -> None:
