@@ -481,6 +481,7 @@ def test_what_a_shell_started_before_it_became_a_command_lives_on() -> None:
     child = psutil.Process(int(ended.stdout.split()[0]))
     assert child.name() == "sleep"
     child.kill()
+    child.wait(10)
 
 
 def test_options_become_the_config() -> None:

@@ -156,7 +156,7 @@ def test_after_the_clock_was_set_back_silence_is_shown(folder: RunFolder) -> Non
 def test_nobody_to_stop_is_said(folder: RunFolder, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="nobody trains it now"):
         stop(folder)
-    with pytest.raises(ConfigError, match=r"no config\.json there"):
+    with pytest.raises(ConfigError, match="holds runs; give one of them"):
         stop(RunFolder(tmp_path))
 
 

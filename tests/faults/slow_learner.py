@@ -7,7 +7,7 @@ from statistics import mode
 from rmc.common.bus.protocol import METRICS_KEPT
 from tests.faults.loaded import ACTORS, Loaded
 from tests.faults.row import Row, at_length
-from tests.faults.soak import MOST_GROWTH, memory_growth, watch
+from tests.faults.soak import LOOK_SECONDS, MOST_GROWTH, memory_growth, watch
 
 MINUTES = 10.0
 SETTLE_SECONDS = 1800.0  # at most, until Redis keeps as many metrics as it ever will: a slow learner says few
@@ -39,7 +39,7 @@ def settle(run: Loaded, *roles: str) -> None:
 
 def judged(fault: str, run: Loaded, seconds: float, most_growth: float = MOST_GROWTH) -> Row:
     """Whether memory stays as it is, while the actors wait at their credit."""
-    growth = memory_growth(watch(run, seconds, 0.0))
+    growth = memory_growth(watch(run, seconds, 0.0, min(LOOK_SECONDS, seconds / 7)))
     waits = {_waits_for(run, f"actor-{actor}") for actor in range(ACTORS)}
     replay = _waits_for(run, "replay")
     passed = max(growth.values()) < most_growth and waits == {"credit"} and replay == "draws"
