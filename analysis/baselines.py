@@ -38,6 +38,7 @@ from rmc.deploy.run.migrations import FORMAT
 from rmc.deploy.run.opening import default_name, forget_start, has_more_than_a_start, make, new_folder
 from rmc.deploy.run.option_names import changes, flat, option
 from rmc.deploy.run.starts import note_start, resume_command
+from rmc.deploy.run.state import remedy
 
 MAY_CHANGE = {"total_steps", "threads", "checkpoint_steps", "episodes", "env.env_timeout"}
 SAVE_SECONDS = 120.0  # between states that can be gone on with: a replay buffer is large
@@ -268,7 +269,7 @@ def evaluate(
     """Deterministic episodes of what a baseline's run saved last, as ``evaluate_policy``. Raises ConfigError."""
     config, states = read_config(folder), saved_states(folder)
     if not states:
-        raise ConfigError("RUN", str(folder.path), "it has no checkpoint yet; train it for longer")
+        raise ConfigError("RUN", str(folder.path), f"it has no checkpoint yet; {remedy(folder)}")
     env = config.env if flicker is None else dataclasses.replace(config.env, flicker=flicker)
     env = env if env_timeout is None else dataclasses.replace(env, env_timeout=env_timeout)
     folder.check_sizes(env.id, layout_sizes(env_layout(env)))

@@ -27,7 +27,7 @@ from rmc.deploy.run.migrations import FORMAT, migrated
 from rmc.deploy.run.validation import validate
 
 OF_SUFFIX = {  # what a file is that is no policy's
-    ".safetensors": "",
+    ".json": "no policy's file; give a run's folder or a policy.safetensors",
     ".onnx": "it is for onnxruntime; give its run, or what rmc export RUN --out policy.safetensors writes",
 }
 EVALUATED = ("return_mean", "return_std", "episodes")
@@ -70,8 +70,7 @@ def read_policy(source: str | Path, checkpoint: str = "latest") -> PolicyFile:
     try:
         return decode(blob)
     except MessageError as error:
-        other = OF_SUFFIX.get(path.suffix.lower(), "no policy's file; give a run's folder or a policy.safetensors")
-        raise ConfigError("policy file", str(path), other or str(error)) from None
+        raise ConfigError("policy file", str(path), OF_SUFFIX.get(path.suffix.lower(), str(error))) from None
 
 
 def decode(blob: bytes) -> PolicyFile:

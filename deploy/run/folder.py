@@ -110,7 +110,7 @@ class RunFolder:
             return f"is not there{near_run(self.path, '; give the folder of a run')}"
         run = self.path.parent.parent
         if self.path.name.isdecimal() and (run / "config.json").exists():
-            return f"is a checkpoint; give its run, {run.name}, with --checkpoint {int(self.path.name)}"
+            return f"is a checkpoint; give its run, {run}"
         if next(self.path.glob("*/config.json"), None) is not None:
             return "holds runs; give one of them, as rmc list names them"
         return "no config.json there; give the folder of a run"

@@ -23,6 +23,8 @@ from rmc.deploy.run.validation import validate_new
 if TYPE_CHECKING:  # imports torch
     from rmc.deploy.run.warm_start import InitialCheckpoint
 
+# What a finished run takes: a last evaluation that was cut is played again, and fewer steps wait for none.
+LAST_EVALUATION = {"evaluator.episodes", "evaluator.evaluation_seconds", "env.env_timeout", "total_steps"}
 SAME_AGENT = {  # what a run that goes on may have otherwise, and learns the same
     "total_steps",
     "actors",
@@ -214,7 +216,7 @@ def taken_up(folder: RunFolder, config: RunConfig, options: LaunchOptions) -> Ru
     folder.check_sizes(config.env.id, config.sizes())
     check_checkpoints(folder)
     _check_begun(folder, options)
-    _check_unfinished(folder, before, config)
+    _check_unfinished(folder, before, config, options.launcher == "ray")
     return before
 
 
@@ -230,13 +232,14 @@ def _check_changes(folder: RunFolder, before: RunConfig, config: RunConfig) -> N
             raise ConfigError(name, now, fix)
 
 
-def _check_unfinished(folder: RunFolder, before: RunConfig, config: RunConfig) -> None:
+def _check_unfinished(folder: RunFolder, before: RunConfig, config: RunConfig, on_ray: bool) -> None:
     """Raises ConfigError for the first change that would wait for steps that nobody asks for."""
     result = folder.result()
     if result is None or result["env_steps"] < config.total_steps:
         return
+    fitted = {"actors", "learner.threads"} if on_ray else set()  # to what the cluster has now
     for path, (_, now) in changes(before, config).items():
-        if not path.startswith("evaluator."):  # of a last evaluation that is played again
+        if path not in LAST_EVALUATION | fitted:
             fix = f"all {result['env_steps']:,} steps are trained; leave it, or take more --total-steps"
             raise ConfigError(option(path), now, fix)
 

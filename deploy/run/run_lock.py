@@ -91,7 +91,7 @@ class RunLock:
             raise self._is_trained()
 
     def _is_trained(self) -> ConfigError:
-        fix = "this run is being trained; stop it first, or watch it: rmc attach"
+        fix = "this run is being trained; stop it first, or look at it: rmc stats"
         return ConfigError("--run-dir", str(self._folder), fix)
 
     def trainer(self) -> int | None:

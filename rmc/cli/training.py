@@ -90,7 +90,7 @@ def _conduct(
         if note := reach_note(config):
             console.print(note, soft_wrap=True)
         if (result := folder.result()) is not None:  # no step is missing: it would be gone else
-            text = f"all {config.total_steps:,} steps are trained; {resume_command(folder)} --total-steps N goes on"
+            text = f"all {result['env_steps']:,} steps are trained; {resume_command(folder)} --total-steps N goes on"
             console.print(text, soft_wrap=True)
             if is_complete(result):
                 status = 0

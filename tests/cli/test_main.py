@@ -109,8 +109,8 @@ def test_the_flags_are_these(command: str, expected: list[str], capsys: pytest.C
 
 
 def classes(kind: type) -> Iterator[type]:
-    """A command's dataclass, and those of its parts and subcommands."""
-    yield kind
+    """A command's dataclass, those that it inherits from, and those of its parts and subcommands."""
+    yield from filter(is_dataclass, kind.__mro__)
     for hint in get_type_hints(kind).values():
         yield from (one for part in (hint, *get_args(hint)) if is_dataclass(part) for one in classes(part))
 

@@ -160,7 +160,7 @@ def test_a_second_start_is_not_told_of_the_port_that_the_first_one_has(
         words = ["resume", str(folder.path), "--metrics-port", str(port)]
         assert main.run(words) == 2
         folder.lock.release()
-    fault = "this run is being trained; stop it first, or watch it: rmc attach"
+    fault = "this run is being trained; stop it first, or look at it: rmc stats"
     assert capsys.readouterr().err == f"rmc: --run-dir='{folder.path}': {fault}\n"
 
 

@@ -14,7 +14,7 @@ from rmc.deploy.run import metrics_tail, opening
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RESULT, RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
-from rmc.deploy.run.opening import MAY_CHANGE, open_run
+from rmc.deploy.run.opening import MAY_CHANGE, open_run, taken_up
 from rmc.deploy.run.option_names import flat
 from rmc.deploy.run.presets import debug
 from rmc.deploy.run.starts import format_starts, last_launch, starts
@@ -61,19 +61,23 @@ def test_every_option_may_change_or_is_refused_with_the_reason(path: str, folder
         assert len(starts(folder)) == 1
 
 
-@pytest.mark.parametrize(("path", "value"), [("total_steps", 3_000), ("actors", 3), ("evaluator.episodes", 3)])
-def test_nothing_changes_in_a_run_that_has_no_step_to_train(path: str, value: int, folder: RunFolder) -> None:
-    changed = with_value(CONFIG, path, value)
+def test_a_run_with_no_step_to_train_takes_no_option_that_would_wait(folder: RunFolder) -> None:
+    changed = with_value(CONFIG, "actors", 3)
     folder.write_result(FINISHED)
-    if path.startswith("evaluator."):  # its last evaluation may have been cut
-        open_run(changed, LaunchOptions(folder.path)).lock.release()
-        assert folder.config() == changed
-        return
-    with pytest.raises(ConfigError, match=f"--.*={value}: all 4,000 steps are trained; leave it, or take more --total"):
+    with pytest.raises(ConfigError, match="--actors=3: all 4,000 steps are trained; leave it, or take more --total"):
         open_run(changed, LaunchOptions(folder.path))
     assert (folder.config(), folder.result(), len(starts(folder))) == (CONFIG, FINISHED, 1)
+    assert taken_up(folder, changed, LaunchOptions(folder.path, launcher="ray")) == CONFIG  # fitted to the cluster
     open_run(dataclasses.replace(changed, total_steps=9_000), LaunchOptions(folder.path)).lock.release()
     assert folder.result() is None
+
+
+@pytest.mark.parametrize("path", sorted(opening.LAST_EVALUATION))
+def test_a_run_with_no_step_to_train_takes_what_its_last_evaluation_does(path: str, folder: RunFolder) -> None:
+    changed = with_value(CONFIG, path, 3_000 if path == "total_steps" else another(path, flat(CONFIG)[path]))
+    folder.write_result(FINISHED)
+    open_run(changed, LaunchOptions(folder.path)).lock.release()
+    assert (folder.config(), folder.result()) == (changed, FINISHED)
 
 
 def test_a_run_goes_on_from_an_older_checkpoint_and_is_refused_where_none_is_whole(folder: RunFolder) -> None:
