@@ -47,12 +47,13 @@ def holder(folder: RunFolder, status: int) -> Iterator[subprocess.Popen[str]]:
         yield owner
 
 
-def test_a_trainer_is_known_until_it_ends(folder: RunFolder) -> None:
+def test_a_trainer_is_known_until_it_ends(folder: RunFolder, caplog: pytest.LogCaptureFixture) -> None:
     assert (folder.lock.trainer(), folder.lock.ended()) == (None, None)
     with holder(folder, 130) as owner:
         assert folder.lock.trainer() == owner.pid == launcher_pid(folder)
         with pytest.raises(ConfigError, match="this run is being trained; stop it first"):
             folder.lock.take()
+        assert caplog.messages == []  # it is refused at once: nobody waits for the lock
         assert folder.lock.trainer() == owner.pid  # who was refused has changed nothing
         assert folder.lock.ended() is None
         owner.communicate("\n")
