@@ -9,14 +9,14 @@ MODEL_PROCESS = "rmc learner: memory and world model"  # the title of the proces
 
 @dataclass(frozen=True)
 class UpdateConfig:
-    """The algorithm: step sizes, discount, losses."""
+    """The algorithm: learning rates, discount, losses."""
 
     learning_rate: float = 3e-4
-    """Adam's step size for every network."""
+    """Adam's learning rate for every network."""
     memory_learning_scale: float = 1.0
-    """The memory's step size, as a multiple of the others'."""
+    """The memory's learning rate, as a multiple of the others'."""
     alpha_learning_rate: float = 3e-4
-    """Adam's step size for the temperature."""
+    """Adam's learning rate for the temperature."""
     target_entropy: float = -1.0
     """What the temperature holds the policy's entropy at, in nats for each dimension of the action."""
     gamma: float = 0.99
@@ -53,7 +53,7 @@ class UpdateConfig:
     """Weight of the largest against the mean absolute TD error in a window's priority."""
 
     policy_ema_updates: int = 0
-    """Updates that the saved and evaluated policy averages over, a tenth of those made at most; 0: off."""
+    """Updates that the saved and evaluated policy averages over, a tenth of those made at most; below 10: off."""
 
     def halves_are_apart(self) -> bool:
         """Whether memory and world model read nothing of critics, policy and temperature, nor of a common norm."""
@@ -74,7 +74,7 @@ class LearnerConfig:
     importance_exponent: float = 0.4
     """How far importance weights undo prioritized sampling; 1 is wholly."""
     publish_updates: int = 20
-    """Updates between broadcasts of the policy."""
+    """Updates after which the policy is published to the actors again."""
     checkpoint_steps: int = 10_000
     """Agent steps between checkpoints. The evaluator plays the newest one whenever it is free."""
     keep_checkpoints: int = 3
@@ -82,4 +82,4 @@ class LearnerConfig:
     precision: Precision = "auto"
     """Of matrix products. auto: bfloat16 where the CPU has instructions for it, TensorFloat-32 on a GPU."""
     threads: int = 0
-    """The learner's CPU threads; 0 finds the fastest number. From 2 on, scheme 3 trains in two processes."""
+    """The learner's CPU threads; 0 finds the fastest number. With scheme 3, 0 or 2 and more take two processes."""

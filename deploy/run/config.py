@@ -55,7 +55,7 @@ class RunConfig:
     seed: int = 0
     """Seed of networks, environments, noise and sampling."""
     total_steps: int = 1_000_000
-    """Agent steps, of all actors together. With action_repeat K each is K environment steps."""
+    """Agent steps of all actors, more than --warmup-steps. With action_repeat K each is K environment steps."""
     actors: int = 1
     """Actor processes."""
     window: WindowConfig = field(default_factory=WindowConfig)
