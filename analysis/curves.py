@@ -24,6 +24,7 @@ LABELS = {"env_steps": "agent steps", "updates": "updates", "wall_s": "wall time
 LEGEND_WIDTH, LEGEND_LINE = 55, 0.22  # characters under a panel, inches
 SAME_LENGTH = 1.05  # runs overshoot their end a little
 POINTS, CURVE_RESAMPLES, COLUMNS, LAST, WIDTH = 100, 300, 3, 5, 120
+DASHES = ("-", "--", ":", "-.")
 HEADINGS = ("agent", "seeds", "return", f"worst of last {LAST}", "steps", "updates", "wall s")
 Groups = dict[str, dict[str, list[History]]]  # environment -> agent -> its runs
 Line = tuple[NDArray[np.float64], NDArray[np.float64]]  # places, and returns there
@@ -84,8 +85,8 @@ def draw(groups: Groups, by: Axis, out: Path) -> None:
     handles: dict[str, Any] = {}
     for panel, (env, by_agent) in zip(panels, groups.items(), strict=False):
         for agent, runs in by_agent.items():
-            color = f"C{agents.index(agent) % 10}"
-            handles.setdefault(agent, draw_agent(panel, [curve(run, by) for run in runs], color))
+            line = draw_agent(panel, [curve(run, by) for run in runs], agents.index(agent))
+            handles.setdefault(agent, line)
         panel.set_title(env, parse_math=False)
         panel.set_xlabel(LABELS[by])
         panel.locator_params(axis="x", nbins=5)  # more would run into each other
@@ -99,18 +100,24 @@ def draw(groups: Groups, by: Axis, out: Path) -> None:
     figure.savefig(out, dpi=110)
 
 
-def draw_agent(panel: Any, curves: list[Line], color: str) -> Any:
-    """Few runs as a line each, more as their mean and its interval where all have been; a line for the legend."""
+def draw_agent(panel: Any, curves: list[Line], index: int) -> Any:
+    """Few runs as a line each, more as their mean and its interval where all have been; a line for the legend.
+
+    ``index`` is the agent's among those of the figure: it has a colour, and from the eleventh on dashes.
+    """
+    style: Any = {"color": f"C{index % 10}", "linestyle": DASHES[index // 10 % len(DASHES)]}
     low, high = _shared(curves)
     if not _has_band(curves):
-        style: Any = {"color": color, "linewidth": 1.2, "alpha": 0.8, "marker": "o", "markersize": 2.5}
+        style |= {"linewidth": 1.2, "alpha": 0.8}
+        if max(len(x) for x, _ in curves) <= POINTS:  # in an SVG each marker is an element
+            style |= {"marker": "o", "markersize": 2.5}
         lines = [panel.plot(*one, **style)[0] for one in curves]
         return lines[0]
     places = np.linspace(low, high, POINTS)
     returns = np.stack([np.interp(places, *one) for one in curves])  # (R, POINTS)
-    line = panel.plot(places, [interquartile_mean(at) for at in returns.T], color=color)[0]
+    line = panel.plot(places, [interquartile_mean(at) for at in returns.T], **style)[0]
     bands = [interval(interquartile_mean, at[:, None], resamples=CURVE_RESAMPLES) for at in returns.T]
-    panel.fill_between(places, *np.transpose(bands), color=color, alpha=0.2, linewidth=0)
+    panel.fill_between(places, *np.transpose(bands), color=style["color"], alpha=0.2, linewidth=0)
     return line
 
 

@@ -73,9 +73,12 @@ def export(policy: PolicyFile, out: Path) -> None:
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
     """The exporter tells of its own steps and of deprecations in its own code."""
-    level = logging.getLogger("torch.onnx").level
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    exporter = logging.getLogger("torch.onnx")
+    level = exporter.level
+    exporter.setLevel(logging.ERROR)
     with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
         warnings.simplefilter("ignore")
-        yield
-    logging.getLogger("torch.onnx").setLevel(level)
+        try:
+            yield
+        finally:
+            exporter.setLevel(level)

@@ -215,13 +215,13 @@ def _evaluations(records: Iterable[dict[str, Any]]) -> list[Evaluation]:
         elif _says(record, "evaluator", "time", "eval_update", "eval_return_mean", "eval_return_std"):
             played.append(record)
     evaluations: list[Evaluation] = []
-    for record in played:
+    times = _between([record["time"] for record in played], walls)
+    for record, wall in zip(played, times, strict=True):
         updates, own = record["eval_update"], _says(record, "evaluator", "eval_env_steps")
-        at = int(record["eval_env_steps"] if own else _between(updates, steps))  # older runs say the update alone
+        at = int(record["eval_env_steps"] if own else _between([updates], steps)[0])  # older runs say the update alone
         while evaluations and evaluations[-1].env_steps >= at:
             evaluations.pop()
-        wall, mean, std = _between(record["time"], walls), record["eval_return_mean"], record["eval_return_std"]
-        evaluations.append(Evaluation(at, updates, wall, mean, std))
+        evaluations.append(Evaluation(at, updates, wall, record["eval_return_mean"], record["eval_return_std"]))
     return evaluations
 
 
@@ -230,7 +230,9 @@ def _says(record: dict[str, Any], role: str, *names: str) -> bool:
     return record.get("role") == role and all(is_finite(record.get(name)) for name in names)
 
 
-def _between(at: float, points: dict[Any, Any]) -> float:
-    """What lies at ``at`` on the line through the points that are known."""
+def _between(at: list[float], points: dict[Any, Any]) -> list[float]:
+    """What lies at each of ``at`` on the line through the points that are known."""
     places = sorted(points)
-    return float(np.interp(at, places, [points[place] for place in places])) if places else 0.0
+    values = np.interp(at, places, [points[place] for place in places]) if places else np.zeros(len(at))
+    on_line: list[float] = values.tolist()
+    return on_line

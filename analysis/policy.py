@@ -10,6 +10,7 @@
 Shapes: N episodes side by side, O observation, A action, S state, M flags of what is missing.
 """
 
+import copy
 import reprlib
 from numbers import Integral
 from pathlib import Path
@@ -135,12 +136,9 @@ class Policy:
         return self._runner
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but the buffers that it acts with: a pickle would part them from their views."""
-        return self.__dict__ | {"_runner": self._runner is not None}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__ |= state
-        self._runner = policy_runner(self.header, self._file.blob, len(self._state)) if state["_runner"] else None
+        """A copy's own memory and noise, without the buffers that it acts with: it makes those when it acts."""
+        memory = {"_state": self._state.copy(), "_prev_action": self._prev_action.copy()}
+        return self.__dict__ | {"_runner": None, "_rng": copy.deepcopy(self._rng)} | memory
 
     def _in_environment(self, action: Floats) -> NDArray[Any]:
         """(N, A) in [-1, 1] -> (N, ...) as the environment takes it."""

@@ -80,8 +80,8 @@ def _returns(histories: list[History]) -> list[dict[str, Any]]:
             {
                 "name": env,
                 "colours": colours,
-                "over_steps": returns(agents, colours, "env_steps"),
-                "over_wall": returns(agents, colours, "wall_s"),
+                "over_steps": returns(agents, "env_steps"),
+                "over_wall": returns(agents, "wall_s"),
                 "final": [[agent, *cells(past)] for agent, past in agents.items()],
             }
         )

@@ -44,7 +44,7 @@ def _drawn(figure: Figure) -> str:
     return data_uri(file.getvalue(), "image/svg+xml")
 
 
-def returns(agents: dict[str, list[History]], colours: dict[str, str], by: Axis) -> str:
+def returns(agents: dict[str, list[History]], by: Axis) -> str:
     """Evaluation returns of one environment's agents, drawn as ``rmc plot`` does."""
     with rc_context(STYLE):
         figure = Figure(figsize=SIZE, layout="constrained")
@@ -52,9 +52,9 @@ def returns(agents: dict[str, list[History]], colours: dict[str, str], by: Axis)
         scale, unit = (
             _time_unit([one.wall_s for runs in agents.values() for one in runs]) if by == "wall_s" else (1, "")
         )
-        for agent, runs in agents.items():
+        for index, runs in enumerate(agents.values()):
             lines = [(places / scale, values) for places, values in (curve(run, by) for run in runs)]
-            draw_agent(panel, lines, colours[agent])
+            draw_agent(panel, lines, index)
         panel.set_xlabel(f"wall time ({unit})" if unit else LABELS[by])
         panel.set_ylabel("evaluation return")
         panel.locator_params(axis="x", nbins=6)
@@ -158,5 +158,7 @@ def _strips(stretches: list[tuple[float, Vitals]], kinds: list[str], reasons: li
             panel.grid(visible=False)
         panels[-1].set_xlabel(f"wall time ({unit})")
         names = [name if name == "busy" else f"waits for {name}" for name in handles]
-        figure.legend(handles.values(), names, loc="outside upper center", ncols=min(4, len(names)), fontsize=8)
+        shown = figure.legend(handles.values(), names, loc="outside upper center", ncols=min(4, len(names)), fontsize=8)
+        for text in shown.get_texts():  # a role's own words
+            text.set_parse_math(False)
         return _drawn(figure)

@@ -48,7 +48,7 @@ class ReportRun:
         folder = RunFolder(path)
         about = history.describe(path)
         timed = (record for record in folder.records() if is_finite(record.get("time")))
-        records = [{name: value for name, value in one.items() if name in DRAWN} for one in timed]
+        records = [{name: one[name] for name in DRAWN if name in one} for one in timed]  # no names of their own
         try:
             past = history.of_run(folder)
         except ConfigError:

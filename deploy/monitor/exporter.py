@@ -67,12 +67,13 @@ class RunCollector(Collector):
     def collect(self) -> Iterator[Metric]:
         """Every metric, as it is now."""
         status, roles = self._status, self._status.roles
+        last = status.last if status.last and status.last.is_complete else None
         about = {"run": self._run, "env": status.env, "preset": status.preset, "seed": str(status.seed)}
         yield InfoMetricFamily("rmc_run", "The run.", about)
         for name, text, value in (
             ("total_steps", "Agent steps of the run's total.", status.total_steps),
-            ("evaluation_return", "Mean of the last evaluation.", status.last.return_mean if status.last else None),
-            ("evaluation_return_best", "Mean of the best one.", status.best.return_mean if status.best else None),
+            ("evaluation_return", "Mean of the last evaluation.", last and last.return_mean),
+            ("evaluation_return_best", "Mean of the best one.", status.best and status.best.return_mean),
         ):
             yield GaugeMetricFamily(f"rmc_{name}", text, value)
         silent = status.silent()

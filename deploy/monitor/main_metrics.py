@@ -3,7 +3,7 @@
 from statistics import mean
 from typing import Any
 
-from rmc.common.bus.metrics_record import is_finite
+from rmc.common.bus.metrics_record import is_complete, is_finite
 from rmc.deploy.monitor.run_status import RunStatus
 
 MAIN = "Main/"  # TensorBoard sorts capitals before the roles' names
@@ -29,8 +29,8 @@ def main_metrics(status: RunStatus) -> dict[str, float]:
 
 
 def evaluation_metrics(record: dict[str, Any]) -> dict[str, float]:
-    """What a record says of an evaluation; empty where it is none."""
+    """What a record says of an evaluation; empty where it is none, or an episode was cut or broken."""
     names = {"evaluation_return": "eval_return_mean", "evaluation_return_std": "eval_return_std"}
-    if record["role"] != "evaluator":
+    if record["role"] != "evaluator" or not is_complete(record):
         return {}
     return {MAIN + name: float(record[key]) for name, key in names.items() if is_finite(record.get(key))}

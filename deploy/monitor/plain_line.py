@@ -1,7 +1,7 @@
 """The state of a run as one line, for where there is no terminal."""
 
 from rmc.common.return_text import return_text
-from rmc.deploy.monitor.figures import number, time_and_eta
+from rmc.deploy.monitor.figures import known_return, number, time_and_eta
 from rmc.deploy.monitor.notices import notices, waits
 from rmc.deploy.monitor.run_status import RunStatus
 
@@ -22,6 +22,8 @@ def line(status: RunStatus) -> str:
 
 
 def _evaluation(status: RunStatus) -> str:
-    if status.last is None or status.best is None:
+    last, best = status.last, status.best
+    if last is None:
         return f"eval {number(None)}"
-    return f"eval {return_text(status.last.return_mean)} (best {return_text(status.best.return_mean)})"
+    note = "" if last.is_complete else "incomplete; "
+    return f"eval {return_text(last.return_mean)} ({note}best {known_return(best and best.return_mean)})"

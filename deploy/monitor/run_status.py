@@ -21,12 +21,16 @@ UNHEARD_SECONDS = 30.0  # of a role that has not spoken yet: it imports, and mak
 
 @dataclass(frozen=True)
 class EvaluationStatus:
-    """Deterministic episodes of one checkpoint; None is what the record did not say."""
+    """Deterministic episodes of one checkpoint; None is what the record did not say.
+
+    One that is not complete, as an episode was cut or broken, is shown, and compared with no other.
+    """
 
     return_mean: float
     return_std: float | None
     update: int | None
     env_steps: int | None
+    is_complete: bool
 
 
 class RunStatus:
@@ -117,8 +121,8 @@ class RunStatus:
             return
         deviation = deviation if is_finite(deviation) else None
         at = _steps(record.get("eval_env_steps"))
-        self.last = EvaluationStatus(float(score), deviation, _steps(record["eval_update"]), at)
-        if is_complete(record) and (self.best is None or self.last.return_mean > self.best.return_mean):
+        self.last = EvaluationStatus(float(score), deviation, _steps(record["eval_update"]), at, is_complete(record))
+        if self.last.is_complete and (self.best is None or self.last.return_mean > self.best.return_mean):
             self.best = self.last
 
     def silent(self) -> dict[str, float]:

@@ -108,7 +108,8 @@ def _evaluation(evaluation: EvaluationStatus | None) -> str:
         return number(None)
     steps = evaluation.env_steps
     at = f"step {steps:,}" if steps is not None else f"update {number(evaluation.update, ',')}"
-    return f"{return_text(evaluation.return_mean, evaluation.return_std)} at {at}"
+    note = "" if evaluation.is_complete else ", incomplete"
+    return f"{return_text(evaluation.return_mean, evaluation.return_std)} at {at}{note}"
 
 
 def _details(status: RunStatus) -> list[Fact]:

@@ -87,6 +87,18 @@ def test_an_evaluation_that_was_cut_is_compared_with_no_other(tmp_path: Path) ->
     assert (past.env_steps, past.updates, past.wall_s) == (1000, 100, 2.0)  # as long as others that finished
 
 
+@pytest.mark.timeout(60)
+def test_a_week_of_evaluations_is_read_at_once(tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text(to_json(robust("Hopper-v5")))
+    minutes = range(1, 10_001)
+    launcher = [{"role": "launcher", "time": 60.0 * at, "wall_s": 30.0 * at} for at in minutes]
+    said = {"role": "evaluator", "eval_return_mean": 1.0, "eval_return_std": 0.0}
+    played = [said | {"time": 60.0 * at, "eval_update": at, "eval_env_steps": at} for at in minutes]
+    (tmp_path / "metrics.jsonl").write_text("".join(f"{json.dumps(line)}\n" for line in launcher + played))
+    (past,) = history.read_histories(tmp_path)
+    assert [(one.env_steps, one.wall_s) for one in past.evaluations] == [(at, 30.0 * at) for at in minutes]
+
+
 def test_of_a_checkpoint_that_was_played_twice_the_last_counts(tmp_path: Path) -> None:
     (tmp_path / "config.json").write_text(to_json(robust("Hopper-v5")))
     played = {"role": "evaluator", "eval_update": 50, "eval_env_steps": 500, "eval_return_std": 1.0}
@@ -308,15 +320,15 @@ def test_few_seeds_are_lines_and_many_a_band(tmp_path):
 
     panel = Figure().subplots()
     few, many = (groups["HalfCheetah-v5"][agent] for agent in ("SAC", "RMC"))
-    curves.draw_agent(panel, [curves.curve(run, "env_steps") for run in few], "C0")
+    curves.draw_agent(panel, [curves.curve(run, "env_steps") for run in few], 0)
     assert (len(panel.lines), len(panel.collections)) == (2, 0)
     assert panel.lines[0].get_xdata().tolist() == [0.0, 1000.0, 2000.0, 3000.0]
     panel = Figure().subplots()
-    line = curves.draw_agent(panel, [curves.curve(run, "wall_s") for run in many], "C0")
+    line = curves.draw_agent(panel, [curves.curve(run, "wall_s") for run in many], 0)
     assert (len(panel.lines), len(panel.collections)) == (1, 1)
     assert line.get_ydata()[-1] == pytest.approx(np.mean([101, 102, 103]))
     panel = Figure().subplots()
-    curves.draw_agent(panel, [(np.array([float(place)]), np.array([7.0])) for place in range(5)], "C0")  # apart
+    curves.draw_agent(panel, [(np.array([float(place)]), np.array([7.0])) for place in range(5)], 0)  # apart
     assert ([line.get_marker() for line in panel.lines], len(panel.collections)) == (["o"] * 5, 0)
     apart = [dataclasses.replace(history_of("X", seed=seed, initial=None), evaluations=[]) for seed in range(5)]
     apart = [dataclasses.replace(run, evaluations=history_of().evaluations[:1]) for run in apart]
@@ -326,9 +338,16 @@ def test_few_seeds_are_lines_and_many_a_band(tmp_path):
     assert (tmp_path / "curves.png").stat().st_size > 10_000
 
 
+def test_agents_of_one_colour_have_other_dashes_and_long_lines_no_markers():
+    panel, short, long = Figure().subplots(), (np.arange(9.0),) * 2, (np.arange(1e4),) * 2
+    drawn = [curves.draw_agent(panel, [line], index) for line, index in ((short, 0), (short, 10), (long, 1))]
+    looks = [(line.get_color(), line.get_linestyle(), line.get_marker()) for line in drawn]
+    assert looks == [("C0", "-", "o"), ("C0", "--", "o"), ("C1", "-", "None")]
+
+
 def test_a_band_is_drawn_where_all_runs_have_been():
     lines = [(np.array([start, end]), np.array([1.0, 2.0])) for start, end in ((0, 9), (2, 10), (1, 8), (0, 9), (0, 9))]
-    line = curves.draw_agent(Figure().subplots(), lines, "C0")
+    line = curves.draw_agent(Figure().subplots(), lines, 0)
     assert [line.get_xdata()[at] for at in (0, -1)] == [2.0, 8.0]
 
 

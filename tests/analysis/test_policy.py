@@ -1,5 +1,6 @@
 """A policy outside of training: in a user's own loop, and as an ONNX file."""
 
+import copy
 import dataclasses
 import importlib.util
 import itertools
@@ -9,7 +10,7 @@ import re
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,7 +28,7 @@ from rmc.actors.evaluator import first_start
 from rmc.actors.policy_runner import one_thread
 from rmc.analysis import policy as policy_module
 from rmc.analysis.evaluation import evaluate_policy
-from rmc.analysis.policy import load_policy
+from rmc.analysis.policy import Policy, load_policy
 from rmc.analysis.policy_file import read_policy
 from rmc.analysis.run_evaluation import evaluate_run
 from rmc.cli import main, policy_commands
@@ -92,13 +93,17 @@ def test_a_program_with_other_defaults_of_torch_keeps_them(tmp_path: Path) -> No
         assert api.train(config, tmp_path / "new", launcher="lockstep")["eval_episodes"] == 10
 
 
-def test_a_pickled_policy_goes_on_as_the_first_does(run: RunFolder) -> None:
-    policy, frames = load_policy(run.path), np.random.default_rng(0).normal(size=(5, 2, 3))
+@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda policy: pickle.loads(pickle.dumps(policy))])
+def test_a_copy_goes_on_as_the_first_does_and_changes_nothing_in_it(
+    run: RunFolder, copied: Callable[[Policy], Policy]
+) -> None:
+    policy, alone = load_policy(run.path), load_policy(run.path)
+    frames = np.random.default_rng(0).normal(size=(5, 2, 3))
     for frame in frames[:2]:
-        policy.act(frame)
-    other = pickle.loads(pickle.dumps(policy))
-    for frame in frames[2:]:
-        assert (policy.act(frame) == other.act(frame)).all()
+        assert (policy.act(frame, explore=True) == alone.act(frame, explore=True)).all()
+    other = copied(policy)
+    went_on = [[acts.act(frame, explore=True).tolist() for frame in frames[2:]] for acts in (other, policy, alone)]
+    assert went_on[0] == went_on[1] == went_on[2]
 
 
 def test_a_policy_that_began_in_inference_mode_acts_outside_of_it(run: RunFolder) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rmc.analysis import baseline_settings, doctor, report, report_run, video
+from rmc.analysis import baseline_settings, doctor, report, report_figures, report_run, video
 from rmc.analysis.curves import HEADINGS
 from rmc.analysis.history import Evaluation, History
 from rmc.analysis.report_run import DRAWN, ReportRun
@@ -166,6 +166,15 @@ def test_of_a_record_what_is_drawn_is_kept_and_findings_are_the_doctors(trained:
     assert set().union(*read.records) <= DRAWN
     assert {metric for _, _, lines in report.CHARTS for _, metric in lines.values()} <= DRAWN
     assert read.findings == [str(one) for one in doctor.examine(list(read.folder.records()), read.folder.config())]
+
+
+def test_a_role_may_wait_for_what_looks_like_mathematics(trained: Path, tmp_path: Path) -> None:
+    shutil.copytree(trained, tmp_path / "run")
+    metrics = tmp_path / "run" / "metrics.jsonl"
+    metrics.write_text(metrics.read_text().replace('"waiting_for": "credit"', r'"waiting_for": "$\\foo$"'))
+    figure = report_figures.waits(ReportRun.read(tmp_path / "run"))
+    assert figure is not None
+    assert figure.startswith("data:image/svg+xml")
 
 
 def test_all_replay_servers_count_in_the_throughput(trained: Path, tmp_path: Path) -> None:

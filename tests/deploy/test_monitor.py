@@ -25,6 +25,7 @@ from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.monitor import view
+from rmc.deploy.monitor.main_metrics import evaluation_metrics
 from rmc.deploy.monitor.monitor import Monitor
 from rmc.deploy.monitor.plain_line import line
 from rmc.deploy.monitor.run_status import MOST_NAMES, UNHEARD_SECONDS, RunStatus
@@ -219,13 +220,19 @@ def test_evaluations_of_earlier_starts_are_known(config: RunConfig, tmp_path: Pa
 def test_an_evaluation_that_was_cut_is_never_the_best(monitor: Monitor, caplog: pytest.LogCaptureFixture) -> None:
     for update in (3, 6):
         monitor._checkpoints.save(update, {})
-    monitor.take({"role": "evaluator", "eval_update": 3, "eval_return_mean": -900.0, "eval_cut": 0})
-    monitor.take({"role": "evaluator", "eval_update": 6, "eval_return_mean": -20.0, "eval_cut": 1})
-    monitor.take({"role": "evaluator", "eval_update": 6, "eval_return_mean": -10.0, "eval_broken_episodes": 4})
+    whole_and_parts: list[dict[str, Any]] = [
+        {"role": "evaluator", "eval_update": 3, "eval_return_mean": -900.0, "eval_cut": 0},
+        {"role": "evaluator", "eval_update": 6, "eval_return_mean": -20.0, "eval_cut": 1},
+        {"role": "evaluator", "eval_update": 6, "eval_return_mean": -10.0, "eval_broken_episodes": 4},
+    ]
+    for record in whole_and_parts:
+        monitor.take(record)
     assert monitor._checkpoints.best() == 3
     assert monitor.status.best is not None
     assert monitor.status.last is not None
     assert (monitor.status.best.update, monitor.status.last.update) == (3, 6)
+    assert "eval -10 (incomplete; best -900)" in line(monitor.status)
+    assert [evaluation_metrics(one) == {} for one in whole_and_parts] == [False, True, True]
     monitor.take({"role": "evaluator", "eval_update": 9, "eval_return_mean": 50.0})  # still on the learner's node
     assert (monitor._checkpoints.best(), "dropped" in caplog.text) == (3, False)
     monitor._checkpoints.save(9, {})
