@@ -13,6 +13,7 @@ import shutil
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from rmc.common.errors import CheckpointError, ConfigError
 from rmc.common.process.file_lock import release_lock, take_lock
@@ -166,21 +167,28 @@ class CheckpointFolder:
         """Record a checkpoint's evaluation if that beats the best so far; whether the checkpoint is there."""
         if not self.path(number).exists():
             return False
-        if score > self._best_record()[1]:
-            write_whole(self.folder / BEST, json.dumps({"update": number, "eval_return_mean": score}).encode())
+        before = self._best_record()
+        if before is None or score > before["eval_return_mean"]:
+            record = {"update": number, "eval_return_mean": score, "before": before}
+            write_whole(self.folder / BEST, json.dumps(record).encode())
         return True
 
     def best(self) -> int | None:
         """Number of the best checkpoint evaluated so far, if any."""
-        return self._best_record()[0]
+        record = self._best_record()
+        return None if record is None else record["update"]
 
-    def _best_record(self) -> tuple[int | None, float]:
+    def _best_record(self) -> dict[str, Any] | None:
+        """The best that is there, or the best before it: the learner may drop one just as the launcher marks it."""
         try:
-            record = json.loads((self.folder / BEST).read_bytes())
-            number, score = int(record["update"]), float(record["eval_return_mean"])
-            return (number, score) if self.path(number).exists() else (None, float("-inf"))
-        except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
-            return None, float("-inf")
+            newest = json.loads((self.folder / BEST).read_bytes())
+            for record in (newest, newest.get("before") or {}):
+                number, score = int(record["update"]), float(record["eval_return_mean"])
+                if self.path(number).exists():
+                    return {"update": number, "eval_return_mean": score}
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
+            pass
+        return None
 
 
 def _check_names(path: Path, names: Iterable[str]) -> None:

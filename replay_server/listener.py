@@ -25,14 +25,17 @@ def listen(address: str) -> tuple[socket.socket, Path | None, str]:
             listener.setblocking(False)
             return listener, None, f"tcp:{host}:{listener.getsockname()[1]}"
     except (OSError, ValueError) as error:  # the latter for a path with a NUL
-        in_use = isinstance(error, OSError) and error.errno == errno.EADDRINUSE
-        fix = "the port is taken; choose another, or 0 for a free one" if in_use else f"cannot listen there ({error})"
+        fix = f"cannot listen there ({error})"
+        if isinstance(error, OSError) and error.errno == errno.EADDRINUSE:
+            taken = "the port is taken; choose another, or 0 for a free one"
+            fix = "a file is there; choose another path" if scheme == "unix" else taken
         raise ConfigError("replay address", address, fix) from None
     raise ConfigError("replay address", address, "want unix:PATH or tcp:HOST:PORT")
 
 
 def _listen_unix(path: Path) -> socket.socket:
-    path.unlink(missing_ok=True)  # a killed server's; the ring's lock keeps a living one's safe
+    if path.is_socket():  # a killed server's; the ring's lock keeps a living one's safe
+        path.unlink()
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         mask = os.umask(0o177)

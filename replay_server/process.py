@@ -11,7 +11,8 @@ from rmc.replay_server.socket_server import SocketServer
 
 IDLE_WAIT = 0.02  # seconds between looks at the bus while nothing comes in: a look costs 0.3 ms
 FIRST_WAIT = 0.0005  # until the first look after something came
-# Seconds between repeats of the address, in case Redis lost its data, and looks at which learner is the newest.
+# Seconds between repeats of the address, in case Redis lost its data, looks at which learner is the newest, and at the
+# socket's file, which a cleaner of temporary files may take.
 ANNOUNCE_PERIOD = 5.0
 
 
@@ -42,6 +43,7 @@ class ReplayProcess:
             took = self.server.step()
             if now >= self._next_announcement:
                 self._next_announcement = now + ANNOUNCE_PERIOD
+                self.sockets.stay_reachable()
                 self.sockets.fence(self.server.bus.current_epoch("learner"))  # an older one may come to us first
                 self.server.bus.announce_replay(self.server.owner, self.sockets.address)
         except (BusUnavailable, BusFull):

@@ -68,6 +68,18 @@ class SocketServer:
         """Wait until somebody is ready, at most so long."""
         self._selector.select(seconds)
 
+    def stay_reachable(self) -> None:
+        """Listen again where others have removed the socket's file. Who is connected stays so."""
+        if self._path is None or self._path.exists():
+            return
+        with contextlib.suppress(ConfigError):  # its folder is away, too; the next look tries again
+            listener, *_ = listen(self.address)
+            log.warning("%s was removed; it is made again", self._path)
+            self._selector.unregister(self._listener)
+            self._listener.close()
+            self._listener = listener
+            self._selector.register(listener, READ)
+
     def poll(self) -> bool:
         """Serve whoever is ready; whether there was anyone."""
         ready = self._selector.select(0.0)

@@ -2,7 +2,6 @@
 
 import json
 import logging
-import signal
 import time
 from pathlib import Path
 
@@ -27,7 +26,6 @@ from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 
 TICK_SECONDS = 0.2  # between looks at the roles and their metrics: a look costs 3 ms
-UNREACHABLE_SECONDS = 1.0  # without its socket, until a replay server is started again
 OUTAGE_SECONDS = 86_400.0  # of a Redis that answered once, until a role that is started amid it gives up
 log = logging.getLogger(__name__)
 
@@ -51,8 +49,6 @@ class LocalRun:
     ) -> None:
         self._redis = RunRedis(config, folder, stop, redis_url)
         self.bus = self._redis.bus
-        self._shards = config.shards()
-        self._listening: dict[str, tuple[int | None, float]] = {}  # who listened, and when it was seen last
         self.supervisor = Supervisor(
             commands(config, folder, self._redis.sockets, device),
             lambda role: {URL_VARIABLE: self._redis.url(role), PATIENCE_VARIABLE: str(OUTAGE_SECONDS)},
@@ -64,29 +60,7 @@ class LocalRun:
     def tend(self) -> None:
         """Start again what died: roles, and the embedded Redis. Raises RoleDied."""
         self._redis.tend()
-        self._end_unreachable()
         self.supervisor.tend()
-
-    def _end_unreachable(self) -> None:
-        """A replay server whose socket others have removed is started again, and listens again.
-
-        One that ends removes it, too: it is given the time to say why.
-        """
-        for shard in self._shards:
-            role, socket, now = (
-                self.supervisor.roles[shard.role],
-                self._redis.sockets / f"{shard.role}.sock",
-                time.monotonic(),
-            )
-            pid, since = self._listening.get(shard.role, (role.pid, now))
-            if socket.exists():
-                self._listening[shard.role] = role.pid, now
-            elif pid != role.pid:
-                self._listening.pop(shard.role, None)
-            elif now - since > UNREACHABLE_SECONDS:
-                log.warning("%s was removed; starting %s again", socket, shard.role)
-                self._listening.pop(shard.role)
-                role.signal(signal.SIGKILL)
 
     def finished(self) -> bool:
         """Whether the learner has ended cleanly."""
@@ -166,7 +140,7 @@ def _watched(registration: Registration, folder: RunFolder, bus: RedisBus, monit
         reason = reason if stop.requested else "finished"
         deadline = time.monotonic() + CheckpointFolder(folder.checkpoints).patience(STOP_SECONDS)
         while (stop.requested or not asked) and time.monotonic() < deadline:
-            asked = asked or asked_to_stop(bus, reason)
+            asked = asked_to_stop(bus, reason) or asked  # again: a Redis may come back without it
             monitor.watch(bus)  # the learner saves; what it says then is still recorded
             time.sleep(TICK_SECONDS)
     finally:

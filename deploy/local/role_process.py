@@ -79,9 +79,16 @@ class Process:
         while True:
             with suppress(BusUnavailable):
                 if (raw := self.bus.config()) is not None:
+                    self._check_goes_on(run)
                     return from_registration(raw)
             if not waits.wait(f"run {run} to be registered in that Redis"):
                 raise ConfigError("--run", run, "no run of this name is registered in that Redis; start it first")
+
+    def _check_goes_on(self, run: str) -> None:
+        """A role that begins after the run's end would write what nobody removes. Raises SystemExit."""
+        if (reason := self.bus.stop_requested()) is not None:
+            log.warning("run %s has ended: %s", run, reason)
+            raise SystemExit(0)
 
     @contextmanager
     def starting(self, role: str, make_room: Callable[[], None] = lambda: None) -> Iterator[None]:

@@ -110,9 +110,8 @@ class Monitor:
             log.warning("%s %s", self._folder.path, change)
 
     def _take_in(self, bus: Bus) -> None:
-        while records := self._read(bus):
-            for record in records:
-                self.take(record | {"time": time.time()})  # by one clock: machines' clocks differ
+        for record in self._read(bus):  # one read: a role that floods its stream must not keep the launcher
+            self.take(record | {"time": time.time()})  # by one clock: machines' clocks differ
 
     def _read(self, bus: Bus) -> list[dict[str, Any]]:
         self._refused = bus.refused.total()

@@ -103,8 +103,7 @@ class RoleActor:
         self._replaced = self._run_ends = False
         self.trouble = ""
         self.scratch = scratch_folder(task.scratch)
-        for name, content in task.secrets.items():
-            write_private(self.scratch / name, self._filled(content.decode()).encode())
+        self._write_secrets()
         self._status: int | None = None
         self.prepare()
         logs = self.log_folder()
@@ -112,6 +111,10 @@ class RoleActor:
         command = replace(task.command, words=tuple(map(self._filled, task.command.words)))
         self._role = RoleProcess(command, self._environment(), logs)
         self._start()
+
+    def _write_secrets(self) -> None:
+        for name, content in self._task.secrets.items():
+            write_private(self.scratch / name, self._filled(content.decode()).encode())
 
     def _filled(self, text: str) -> str:
         return (
@@ -201,6 +204,7 @@ class RoleActor:
         self._watcher.join()  # it must not take the new process's absence, or its presence, for the old one's end
         self._replaced = False
         try:
+            self._write_secrets()  # a cleaner of temporary files may have taken them
             self._start()
         except (OSError, RuntimeError):  # no process or thread to be had now: Ray starts this host again
             os._exit(1)

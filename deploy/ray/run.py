@@ -150,9 +150,9 @@ class ClusterRun:
     def stop(self, reason: str) -> None:
         """Ask every role to end, and wait until the learner's last checkpoint is on the head."""
         self.hosts.tell_stop()
-        deadline, asked = time.monotonic() + STOP_SECONDS + self._patience(0.0), False
+        deadline = time.monotonic() + STOP_SECONDS + self._patience(0.0)
         while time.monotonic() < deadline and not self.hosts.all_ended():
-            asked = asked or asked_to_stop(self.bus, reason)  # a Redis that is away is asked again
+            asked_to_stop(self.bus, reason)  # again and again: a Redis may come back without it
             time.sleep(TICK_SECONDS)
         self._redis.end()
 

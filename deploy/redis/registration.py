@@ -34,7 +34,7 @@ class Registration:
     def tend(self) -> None:
         """Look now and then whether Redis still knows, and copy what is counted; while it is away, nothing.
 
-        One that came back with an older config also has the stop that ended the start which wrote that.
+        One that came back with an earlier start's config also has the stop that ended that start.
         """
         if time.monotonic() >= self._look_at:
             self._look_at = time.monotonic() + LOOK_SECONDS

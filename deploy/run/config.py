@@ -5,6 +5,7 @@ The only place that knows every config at once; each role is given its own part.
 
 import dataclasses
 import json
+import secrets
 import types
 import typing
 from dataclasses import dataclass, field
@@ -158,14 +159,18 @@ def checked(config: RunConfig) -> RunConfig:
 
 
 def to_registration(config: RunConfig) -> bytes:
-    """The config as JSON for the roles: with it a role knows the environment's sizes without making one."""
-    return json.dumps(dataclasses.asdict(config) | {"layout": dataclasses.asdict(config.layout)}).encode()
+    """The config as JSON for the roles: with it a role knows the environment's sizes without making one.
+
+    No two are alike, so that a start tells its own from that of an earlier one.
+    """
+    own = {"layout": dataclasses.asdict(config.layout), "start": secrets.token_hex(8)}
+    return json.dumps(dataclasses.asdict(config) | own).encode()
 
 
 def from_registration(text: bytes) -> RunConfig:
     """The config again. Raises ConfigError."""
     raw = _read(text)
-    layout: Any = raw.pop("layout", None) if isinstance(raw, dict) else None
+    layout, _ = (raw.pop("layout", None), raw.pop("start", None)) if isinstance(raw, dict) else (None, None)
     config = from_dict(RunConfig, raw, "config.json ")
     config.__dict__["layout"] = from_dict(EnvLayout, layout, "layout ")  # where the cached property keeps it
     return config

@@ -91,7 +91,7 @@ def test_an_evaluation_that_was_cut_is_compared_with_no_other(tmp_path: Path) ->
 def test_a_week_of_evaluations_is_read_at_once(tmp_path: Path) -> None:
     (tmp_path / "config.json").write_text(to_json(robust("Hopper-v5")))
     minutes = range(1, 10_001)
-    launcher = [{"role": "launcher", "time": 60.0 * at, "wall_s": 30.0 * at} for at in minutes]
+    launcher = [{"role": "launcher", "time": 5.0 * at, "wall_s": 2.5 * at} for at in range(12 * len(minutes) + 1)]
     said = {"role": "evaluator", "eval_return_mean": 1.0, "eval_return_std": 0.0}
     played = [said | {"time": 60.0 * at, "eval_update": at, "eval_env_steps": at} for at in minutes]
     (tmp_path / "metrics.jsonl").write_text("".join(f"{json.dumps(line)}\n" for line in launcher + played))

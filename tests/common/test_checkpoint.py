@@ -40,6 +40,20 @@ def test_best_is_kept_and_only_beaten_by_better(tmp_path):
     assert (folder.best(), folder.numbers()) == (1, [1, 3])
 
 
+def test_one_that_is_dropped_as_it_is_marked_leaves_the_best_before(tmp_path):
+    """The learner drops, the launcher marks: in two processes, neither waits for the other."""
+    folder = CheckpointFolder(tmp_path)
+    for number, score in ((1, 100.0), (2, 200.0)):
+        folder.save(number, FILES)
+        folder.mark_best(number, score)
+    shutil.rmtree(folder.path(2))
+    assert folder.best() == 1
+    folder.keep = 1
+    folder.save(3, FILES)
+    folder.mark_best(3, -5.0)
+    assert (folder.best(), folder.numbers()) == (1, [1, 3])
+
+
 @pytest.mark.parametrize("damage", ["flip", "truncate", "manifest", "missing"])
 def test_damage_is_found_and_an_older_one_used(tmp_path, damage):
     folder = CheckpointFolder(tmp_path)

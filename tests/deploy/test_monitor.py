@@ -6,6 +6,7 @@ import math
 import random
 import tempfile
 import time
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -151,6 +152,20 @@ def test_each_role_speaks_for_itself_only(monitor: Monitor, tmp_path: Path) -> N
     lines = [json.loads(text) for text in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
     assert {record["role"] for record in lines} == {"actor-0", "launcher"}
     assert monitor.status.get("learner", "updates") is None
+
+
+class FloodedBus(MemoryBus):
+    """One role says something new whenever it is read."""
+
+    def records(self, after: Mapping[str, str]) -> tuple[list[dict[str, Any]], dict[str, str]]:
+        self.emit("actor-0", {"time": 1.0})
+        return super().records(after)
+
+
+@pytest.mark.timeout(30)
+def test_a_role_that_never_stops_talking_keeps_nobody(monitor: Monitor) -> None:
+    monitor.watch(FloodedBus())
+    monitor.close()
 
 
 def test_an_evaluation_stands_where_its_checkpoint_was(monitor: Monitor, tmp_path: Path) -> None:

@@ -68,6 +68,40 @@ def test_a_redis_that_came_back_with_what_it_knew_before_is_told_again(
     assert bus.stop_requested() is None
 
 
+def test_the_stop_of_a_start_before_does_not_end_this_one(tmp_path: Path, redis_url: str, run_name: str) -> None:
+    """Where nothing has changed since, and Redis comes back as it was after the former end."""
+    bus, folder = RedisBus(redis_url, run_name), RunFolder(tmp_path)
+    Registration(CONFIG, folder, bus)
+    bus.request_stop("stopped by its launcher")
+    before = bus.config()
+    assert before is not None
+    registered = Registration(CONFIG, folder, bus)
+    bus.set_config(before)
+    bus.request_stop("stopped by its launcher")
+    registered.tend()
+    assert bus.stop_requested() is None
+
+
+def test_a_redis_that_forgets_the_stop_is_told_again(
+    tmp_path: Path, redis_url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, stop = RunFolder(tmp_path), StopSignal()
+    folder.write_config(CONFIG)
+    bus, monitor, looks = RedisBus(redis_url, folder.name), Monitor(folder, CONFIG, Console(quiet=True)), []
+
+    def forgotten(_: object) -> None:
+        looks.append(bus.stop_requested())
+        bus.clear_stop()
+
+    monkeypatch.setattr(launcher, "STOP_SECONDS", 2.0)
+    monkeypatch.setattr(monitor, "watch", forgotten)
+    stop.request()
+    assert not launcher.attend(CONFIG, folder, redis_url, monitor, stop)
+    assert len(looks) > 2
+    assert set(looks) == {"stopped by its launcher"}
+    monitor.close()
+
+
 def test_a_run_started_by_hand_is_told_to_stop_once_redis_takes_it(
     tmp_path: Path, redis_url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -94,6 +94,19 @@ def test_a_role_that_is_replaced_does_not_end_its_host(host: RoleActor, ends: li
     assert ends == [1]
 
 
+def test_a_role_that_is_replaced_has_its_secrets_again(program: Path, tmp_path: Path) -> None:
+    """Though a cleaner of temporary files has taken them."""
+    assert program.exists()
+    actor = RoleActor(
+        Task("run", "run", RoleCommand("replay", ("replay",)), {}, {"secret": b"of the run"}, str(tmp_path))
+    )
+    (actor.scratch / "secret").unlink()
+    actor.restart()
+    assert (actor.scratch / "secret").read_text() == "of the run"
+    actor.close()
+    actor.clear()
+
+
 HOST = """
 import subprocess, sys, time
 from rmc.deploy.local.role_command import RoleCommand

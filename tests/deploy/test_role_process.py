@@ -79,6 +79,19 @@ def test_a_role_waits_for_its_run(
         later.result()
 
 
+@pytest.mark.usefixtures("handlers")
+def test_a_role_of_a_run_that_has_ended_begins_nothing(
+    redis_url: str, run_name: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Its launcher has seen to it that nothing of the run stays in Redis."""
+    bus = RedisBus(redis_url, run_name)
+    Registration(debug(EnvConfig("Pendulum-v1")), RunFolder(tmp_path), bus)
+    bus.request_stop("finished")
+    with pytest.raises(SystemExit) as ended:
+        Process(RunConnection(run_name, redis_url))
+    assert (ended.value.code, caplog.messages) == (0, [f"run {run_name} has ended: finished"])
+
+
 def test_who_is_told_to_stop_waits_no_longer(short: Path, caplog: pytest.LogCaptureFixture) -> None:
     stop = StopSignal()
     with ThreadPoolExecutor(1) as pool:

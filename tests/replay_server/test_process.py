@@ -103,6 +103,28 @@ def test_a_replaced_learner_that_comes_first_is_not_served(
         running.end()
 
 
+def test_where_its_sockets_file_is_removed_it_is_made_again(
+    redis_url: str, run_name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A cleaner of temporary files takes what nobody has opened for days. Who is connected stays so."""
+    monkeypatch.setattr(process, "ANNOUNCE_PERIOD", 0.05)
+    bus = RedisBus(redis_url, run_name)
+    running = Running(tmp_path, RedisBus(redis_url, run_name))
+    try:
+        wait_until(lambda: bus.replay_address("replay") is not None)
+        first = client_of(bus)
+        assert first.sample(16).status is SampleStatus.WAIT
+        (tmp_path / "r.sock").unlink()
+        wait_until((tmp_path / "r.sock").exists)
+        second = client_of(bus)
+        assert [client.sample(16).status for client in (first, second)] == [SampleStatus.WAIT] * 2
+        first.close()
+        second.close()
+    finally:
+        running.end()
+    assert not (tmp_path / "r.sock").exists()
+
+
 @pytest.mark.timeout(90)
 def test_the_learner_is_served_while_redis_is_away_and_intake_goes_on_after(tmp_path: Path) -> None:
     folder = tmp_path / "redis"

@@ -558,7 +558,13 @@ def test_a_taken_port_an_old_file_and_an_empty_secret(serve: Serve, tmp_path: Pa
     with pytest.raises(ConfigError, match="secret"):
         SocketServer(served.replay, served.address, b"", 1)
     path = tmp_path / "r.sock"
-    path.touch()  # as a killed server leaves it
+    path.write_text("a thesis")
+    with pytest.raises(ConfigError, match="a file is there"):
+        SocketServer(served.replay, f"unix:{path}", SECRET, 1)
+    assert path.read_text() == "a thesis"
+    path.unlink()
+    with socket.socket(socket.AF_UNIX) as killed:  # a killed server leaves its socket's file
+        killed.bind(str(path))
     again = SocketServer(served.replay, f"unix:{path}", SECRET, 1)
     assert path.stat().st_mode & 0o777 == 0o600
     again.close()
