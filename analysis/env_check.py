@@ -16,7 +16,7 @@ from rich.console import Console
 from rmc.common.agent_config import STD_FLOOR
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.describe import layout_of
-from rmc.common.env.faults import RAISED, describe_error
+from rmc.common.env.faults import PASSED_ON, describe_error
 from rmc.common.env.layout import EnvLayout
 from rmc.common.env.make import first_env, make_env
 from rmc.common.env.privileged import Privileged
@@ -26,16 +26,19 @@ from rmc.common.env.wrappers import Env
 from rmc.common.errors import EnvFault
 from rmc.common.window import BoolArray, Floats
 from rmc.deploy.run.config import WindowConfig
+from rmc.deploy.run.env_sizes import env_sizes, layout_sizes
 from rmc.deploy.run.memory_reach import format_reach
 
 BESIDE_THE_POINT = (  # of vectors, stretched actions, and what watches the environment
     "is -infinity", "is infinity", "symmetric and normalized", "different from the unwrapped version",
+    "is non-deterministic as", "truncates after 1 step",  # which what follows judges, too, and better
 )  # fmt: skip
 REPEATED_STEPS = 50  # played twice from one seed
 LARGE_REWARD = 100.0  # mean size of a step's reward from which the critics start far from their target
 LARGEST_REWARD = 1e4  # of one step, from which it outweighs all others in a batch
 SMALL_REWARD = 1e-3  # largest size of a step's reward up to which the critics see nothing of it
 LISTED = 20  # dimensions named in a note
+LARGEST_SEED = 2**31 - 1  # with which training may begin an episode
 LARGE_OBSERVATION = 1e4  # from which float32 and a running mean lose precision
 
 
@@ -80,7 +83,7 @@ def check(config: EnvConfig, steps: int, console: Console) -> int:
         lambda: _hints(played, layout.time_limit),
         lambda: _repeated(env),
         lambda: _for_critics(env),
-        lambda: _second(config),
+        lambda: _second(config, layout),
     ]
     lines: list[str] = []
     while stages and not _faults(lines):  # what comes later needs what was before to be sound
@@ -122,7 +125,9 @@ def _guarded(action: Callable[[], None]) -> Iterator[str]:
             action()
         except EnvFault as fault:
             yield f"fault: {fault}"
-        except RAISED as error:  # whatever a user's environment raises is a finding
+        except PASSED_ON:
+            raise
+        except BaseException as error:  # whatever a user's environment raises is a finding
             yield f"fault: {describe_error(error)}"
     for text in dict.fromkeys(_plain(str(warning.message)) for warning in caught):
         yield f"note: {text}"
@@ -157,9 +162,9 @@ def _nonsense(played: Played) -> Iterator[str]:
 
 
 def _hints(played: Played, time_limit: int | None) -> Iterator[str]:
-    observations, rewards = np.stack(played.observations), np.array(played.rewards)
+    observations, rewards = np.stack(played.observations, dtype=np.float64), np.array(played.rewards)
     still = np.ptp(observations, axis=0) == 0.0
-    faint = ~still & (observations.std(0, dtype=np.float64) < STD_FLOOR)
+    faint = ~still & (observations.std(0) < STD_FLOOR)
     if still.any():
         yield f"note: observations {_listed(still)} never changed"
     if faint.any():
@@ -179,7 +184,7 @@ def _repeated(env: Env) -> Iterator[str]:
 
     def play_both() -> None:
         for one in twice:
-            one.play(env, REPEATED_STEPS, seed=1)
+            one.play(env, REPEATED_STEPS, seed=LARGEST_SEED)
 
     yield from _guarded(play_both)
     once, again = (one.observations for one in twice)
@@ -200,14 +205,19 @@ def _for_critics(env: Env) -> Iterator[str]:
         yield f'note: info["privileged"] has {given.size} numbers, which critics alone read with --privileged-critic'
 
 
-def _second(config: EnvConfig) -> Iterator[str]:
-    """Whether another one can be played while the first is there, as in training."""
+def _second(config: EnvConfig, layout: EnvLayout) -> Iterator[str]:
+    """Whether another one of the same sizes can be played while the first is there, as in training."""
     try:
         with closing(make_env(config)) as env:
+            sizes = env_sizes(env)
             Played().play(env, 1, seed=0)  # as the first one stood it
     except Exception as error:
         fix = "take --actors 1 --envs-per-actor 1 --episodes 0"
         yield f"note: no second one can be beside it ({describe_error(error)}); {fix}"
+        return
+    for name, size in layout_sizes(layout).items():
+        if sizes[name] != size:
+            yield f"fault: {name} of a second one are {sizes[name]}, of the first {size}; give each the same"
 
 
 def _reward_notes(sizes: NDArray[np.float64]) -> Iterator[str]:

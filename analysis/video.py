@@ -1,9 +1,10 @@
 """An episode of a policy as a video, rendered off screen."""
 
 import inspect
+import math
 import sys
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
 from rmc.actors.evaluator import first_start, longest_episode
@@ -16,7 +17,7 @@ from rmc.common.env.make import make_env
 from rmc.common.env.process_state import ApartCall
 from rmc.common.env.registered import entry_point, find_spec
 from rmc.common.env.wrappers import Env
-from rmc.common.errors import ConfigError, RmcError, first_line
+from rmc.common.errors import ConfigError, EnvFault, RmcError, first_line
 from rmc.common.extra import check_installed
 from rmc.common.whole_file import written_whole
 
@@ -64,7 +65,7 @@ def record(policy: Policy, env_config: EnvConfig, seed: int, out: Path, longest:
         _follow(env)
         observation, info = env.reset(seed=first_start(seed, final=True))
         size = rendered_frame(env).shape
-        rate = (env.metadata.get("render_fps") or FRAMES_PER_SECOND) / env_config.action_repeat  # a frame an action
+        rate = _frame_rate(env) / env_config.action_repeat  # a frame an action
         with written_whole(out) as path, _told(out):
             with closing(write_frames(str(path), (size[1], size[0]), fps=rate, macro_block_size=1)) as video:
                 video.send(None)  # the generator's start
@@ -77,6 +78,15 @@ def record(policy: Policy, env_config: EnvConfig, seed: int, out: Path, longest:
                         break
             count_frames_and_secs(str(path))  # ffmpeg does not say that it could not write the end
     return total
+
+
+def _frame_rate(env: Env) -> float:
+    """Of the environment's steps, by the second. Raises EnvFault where its metadata says something else."""
+    said = env.metadata.get("render_fps")
+    with suppress(TypeError, ValueError, OverflowError):
+        if 0.0 < (rate := float(said or FRAMES_PER_SECOND)) < math.inf:
+            return rate
+    raise EnvFault(f'the environment\'s metadata["render_fps"] is {said!r}; give frames a second')
 
 
 @contextmanager

@@ -17,7 +17,7 @@ from rmc.analysis.evaluation import FINAL_EPISODES
 from rmc.analysis.run_evaluation import evaluate_run
 from rmc.cli import training
 from rmc.common.env.config import EnvConfig
-from rmc.common.env.process_state import torch_as_imported
+from rmc.common.env.process_state import ProcessState, torch_as_imported
 from rmc.common.env.registered import DM_CONTROL, PYBULLET
 from rmc.common.errors import STOPPED_STATUS, ConfigError
 from rmc.common.process import watchdog
@@ -119,17 +119,18 @@ def _not_none(values: dict[str, Any]) -> dict[str, Any]:
 
 
 class _Callback:
-    """The caller's. An error that it raises ends the run as Ctrl-C does, and is kept."""
+    """The caller's, with torch as it was there. An error that it raises ends the run as Ctrl-C does, and is kept."""
 
     def __init__(self, function: Callback) -> None:
-        self._function = function
+        self._function, self._callers = function, ProcessState.read()
         self.error: BaseException | None = None
 
     def __call__(self, record: dict[str, Any]) -> None:
         if self.error is not None:
             return
         try:
-            self._function(dict(record))
+            with self._callers.of_torch():
+                self._function(dict(record))
         except BaseException as error:  # also one that would end this process
             self.error = error
             if signal.getsignal(signal.SIGINT) is None:  # it goes to a program around Python, which may do anything

@@ -3,21 +3,24 @@
 from studies.study import Scale, Study, before, earlier
 
 ENVS = ("Ant-v5", "HalfCheetah-v5", "Humanoid-v5", "Walker2d-v5", "HumanoidStandup-v5")
+NO_CONTACT_FORCES = "--env-kwargs include_cfrc_ext_in_observation=false"  # as Ant-v4's
+CROSSQ = (
+    "--head-input observation --hidden 8 --embedding 0 --no-impute-missing --no-grounding --scheme 2 --burn-in 0 "
+    "--trained-steps 1 --capacity 110000 --batch-size 256 --replay-ratio 256 --policy-delay 3 --learning-rate 1e-3 "
+    "--alpha-learning-rate 1e-3"
+)
 OURS = {
     "RMC": "train ENV",
     "RMC, target entropy -A": earlier(),
     "RMC, an update a step": earlier("--replay-ratio 240"),
     "RMC, 1e-3": earlier("--learning-rate 1e-3 --alpha-learning-rate 1e-3 --memory-learning-scale 0.3"),
-    "CrossQ's form": earlier(
-        "--head-input observation --hidden 8 --embedding 0 --no-impute-missing --no-grounding --scheme 2 --burn-in 0 "
-        "--trained-steps 1 --capacity 110000 --batch-size 256 --replay-ratio 256 --policy-delay 3 --learning-rate 1e-3 "
-        "--alpha-learning-rate 1e-3"
-    ),
+    "CrossQ's form": earlier(CROSSQ),
+    "CrossQ's form, no contact forces": earlier(f"{CROSSQ} {NO_CONTACT_FORCES}"),
     "RMC, rewards times 0.01": "train ENV --reward-scale 0.01",  # of HumanoidStandup-v5, whose are in the hundreds
     "RMC, target entropy -A, rewards times 0.01": earlier("--reward-scale 0.01"),
     "RMC, heads of 1024": "train ENV --heads 1024 1024",
-    "RMC, no contact forces": "train ENV --env-kwargs include_cfrc_ext_in_observation=false",  # as Ant-v4's
-    "RMC, target entropy -A, no contact forces": earlier("--env-kwargs include_cfrc_ext_in_observation=false"),
+    "RMC, no contact forces": f"train ENV {NO_CONTACT_FORCES}",
+    "RMC, target entropy -A, no contact forces": earlier(NO_CONTACT_FORCES),
     "RMC, h alone": earlier("--head-input hidden"),
     "RMC, policy at every update": earlier("--head-input hidden --policy-delay 1"),
     "RMC, target critics": before(),

@@ -1,8 +1,12 @@
 """An environment that changes its whole process, and says in ``info`` how it finds it. Nothing of ours may notice."""
 
+import io
+import logging
+import logging.config
 import os
 import random
 import signal
+import sys
 import tempfile
 from typing import Any
 
@@ -25,6 +29,8 @@ HABITS = {
     "threads": lambda: torch.set_num_threads(3),
     "device": lambda: torch.set_default_device("meta"),
     "handlers": lambda: [signal.signal(number, nobody) for number in (signal.SIGINT, signal.SIGTERM)],
+    "streams": lambda: setattr(sys, "stdout", io.StringIO()) or setattr(sys, "stderr", io.StringIO()),
+    "logs": lambda: logging.config.dictConfig({"version": 1, "root": {"level": "ERROR"}}),
     "random": lambda: (np.random.seed(1), random.seed(1), torch.manual_seed(1)),  # noqa: NPY002
 }
 
@@ -32,7 +38,8 @@ HABITS = {
 def as_it_is() -> tuple[Any, ...]:
     return (
         os.getcwd(), np.geterr(), torch.get_default_dtype(), torch.is_grad_enabled(), torch.get_num_threads(),
-        torch.get_default_device(),
+        torch.get_default_device(), sys.stdout, sys.stderr, logging.getLogger().level,
+        logging.getLogger("rmc.common.env.make").disabled,
     )  # fmt: skip
 
 

@@ -27,6 +27,11 @@ def visible_slice(env: gym.Env[Any, Any], hide: str) -> slice | None:
     return {"nothing": None, "velocities": slice(0, positions), "positions": slice(positions, None)}[hide]
 
 
+def agent_steps(limit: int | None, config: EnvConfig) -> int | None:
+    """A limit in the environment's steps as one in the agent's, of which the last may be a part."""
+    return None if limit is None else -(-limit // config.action_repeat)
+
+
 def layout_of(env: Env, config: EnvConfig, info: dict[str, Any], privileged: bool) -> EnvLayout:
     """Of an environment as ``make_env`` gives it; ``info`` is that of its first reset.
 
@@ -41,7 +46,7 @@ def layout_of(env: Env, config: EnvConfig, info: dict[str, Any], privileged: boo
         parts(actions),
         tuple(low.tolist()),
         tuple(high.tolist()),
-        None if limit is None else -(-limit // config.action_repeat),
+        agent_steps(limit, config),
         np.size(info.get("missing", False)),
         np.size(info.get("privileged", ())) if privileged else 0,
     )

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 from rmc.common.errors import EnvFault, RmcError, one_line
 
 RAISED = (Exception, SystemExit)  # what a user's code may raise; a module that calls sys.exit ends nobody else
+PASSED_ON = (KeyboardInterrupt, GeneratorExit)  # nobody's fault; all else is theirs, a Rust library's panic too
 INSTALLED = {"site-packages", "dist-packages"}
 STANDARD_LIBRARY = sysconfig.get_path("stdlib")
 ResultT = TypeVar("ResultT")
@@ -19,9 +20,9 @@ def call_env(what: str, call: Callable[..., ResultT], *arguments: Any) -> Result
     """What a method of the environment's gives. Raises EnvFault with the error's place where it raises."""
     try:
         return call(*arguments)
-    except RmcError:
+    except (RmcError, *PASSED_ON):
         raise
-    except RAISED as error:
+    except BaseException as error:
         raise EnvFault(f"the environment's {what} raises {describe_error(error)}") from error
 
 

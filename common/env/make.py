@@ -16,8 +16,8 @@ import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
 from rmc.common.env.config import EnvConfig, check_env_config
-from rmc.common.env.describe import layout_of, structure, visible_slice
-from rmc.common.env.faults import RAISED, call_env, describe_error
+from rmc.common.env.describe import agent_steps, layout_of, structure, visible_slice
+from rmc.common.env.faults import PASSED_ON, RAISED, call_env, describe_error
 from rmc.common.env.layout import EnvLayout
 from rmc.common.env.missing import DropSensors, Flicker
 from rmc.common.env.privileged import Privileged
@@ -44,16 +44,29 @@ def make_env(config: EnvConfig, render: bool = False, privileged: bool = False) 
     with ApartCall(config.id, "make", config.env_timeout):
         spec = find_spec(config.id)
         limit = config.time_limit or _registered_limit(config.id, spec.max_episode_steps)
-        _check_delay(config, limit)
-        env: gym.Env[Any, Any] = WatchedEnv(_make(spec, config, render), config.id, config.env_timeout)
+        made = _make(spec, config, render)
+        own = made.spec.max_episode_steps if made.spec else None  # of a wrapper of the user's
+        limit = min(filter(None, (limit, own)), default=None)
+    env = WatchedEnv(made, config.id, config.env_timeout)
+    try:
+        _check_fit(env, config, limit)
+    except ConfigError:
+        with suppress(*RAISED):
+            env.close()
+        raise
+    return _as_seen(env, config, limit, privileged)
+
+
+def _check_fit(env: gym.Env[Any, Any], config: EnvConfig, limit: int | None) -> None:
+    """Raises ConfigError for spaces in which the agent cannot learn, or options that show nothing of them."""
     fault = call_env("spaces", lambda: space_fault(env.observation_space, env.action_space))
     if fault is None and config.hide != "nothing" and not _says_parts(env):
         fault = f"it does not say which observations are {config.hide}; --hide is for MuJoCo's bodies, like Ant-v5"
     if fault is not None:
-        with suppress(*RAISED):
-            env.close()
         raise ConfigError("ENV", config.id, fault)
-    return _as_seen(env, config, limit, privileged)
+    steps = agent_steps(limit, config)
+    if steps is not None and config.delay >= steps:  # only an episode's first observation would be seen
+        raise ConfigError("--delay", config.delay, f"an episode ends after {steps} steps; take fewer")
 
 
 def _says_parts(env: gym.Env[Any, Any]) -> bool:
@@ -72,7 +85,9 @@ def _make(registered: EnvSpec, config: EnvConfig, render: bool) -> gym.Env[Any, 
         return gym.make(spec, disable_env_checker=True)
     except gym.error.Error as error:
         raise ConfigError("ENV", config.id, f"gymnasium cannot make it ({one_line(error)})") from None
-    except RAISED as error:
+    except PASSED_ON:
+        raise
+    except BaseException as error:
         if isinstance(error, TypeError) and (fault := _keyword_fault(spec)) is not None:
             raise ConfigError("ENV", config.id, fault) from None
         if not config.id.startswith(DM_CONTROL):
@@ -185,13 +200,6 @@ def _registered_limit(env_id: str, limit: Any) -> int | None:
             return steps
     fix = "register a whole number from 1 on, or None"
     raise ConfigError("ENV", env_id, f"its max_episode_steps is {limit!r}; {fix}")
-
-
-def _check_delay(config: EnvConfig, limit: int | None) -> None:
-    """Raises ConfigError where an episode ends before anything but its first observation is seen."""
-    steps = -(-limit // config.action_repeat) if limit else None
-    if steps and config.delay >= steps:
-        raise ConfigError("--delay", config.delay, f"an episode ends after {steps} steps; take fewer")
 
 
 def _redirect_mujoco_warnings() -> None:

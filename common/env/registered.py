@@ -13,7 +13,7 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec, find_highest_version
 
-from rmc.common.env.faults import RAISED, describe_error
+from rmc.common.env.faults import PASSED_ON, RAISED, describe_error
 from rmc.common.errors import ConfigError
 from rmc.common.extra import how_to_install
 
@@ -91,7 +91,9 @@ def _import_users_module(env_id: str, module: str) -> None:
         fix = f"start from the folder that holds {module}" if ours else f"{module} needs it; install it"
         fault = _shadow_fault(module) if ours else None
         raise ConfigError("ENV", env_id, fault or f"{error}; {fix}") from None
-    except RAISED as error:
+    except PASSED_ON:
+        raise
+    except BaseException as error:
         raise ConfigError("ENV", env_id, f"{module} cannot be imported: {describe_error(error)}") from None
 
 

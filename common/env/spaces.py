@@ -43,7 +43,7 @@ def parts(space: gym.Space[Any]) -> tuple[Part, ...]:
     boxes: list[Part] = []
     for name, box in _leaves(space):
         start, shape = boxes[-1].stop if boxes else 0, box.shape or ()
-        boxes.append(Part(name, start, start + math.prod(shape), shape, str(box.dtype)))
+        boxes.append(Part(name, start, start + math.prod(shape), shape, np.dtype(box.dtype).name))
     return tuple(boxes)
 
 
@@ -55,6 +55,9 @@ def vector(space: gym.Space[Any], value: Any) -> NDArray[np.float32]:
 
 
 def _numbers(box: gym.Space[Any], value: Any) -> NDArray[np.float32]:
+    if isinstance(value, np.ma.MaskedArray):  # whose mask would be lost
+        fix = 'return zeros where it masks, and say so in info["missing"]'
+        raise EnvFault(f"the environment's observation is a masked array; {fix}")
     numbers = array("observation", value, "an array of numbers")
     if numbers.shape != box.shape and _sides(numbers.shape) != _sides(box.shape or ()):
         raise EnvFault(f"the environment's observation has shape {numbers.shape}, its space says {box.shape}")
@@ -101,15 +104,15 @@ def _parts(space: gym.Space[Any]) -> list[tuple[Any, gym.Space[Any]]]:
 
 
 def _leaves(space: gym.Space[Any], path: str = "") -> list[tuple[str, gym.Space[Any]]]:
-    """What is left when every Dict and Tuple is taken apart, by dotted path."""
-    if not isinstance(space, gym.spaces.Dict | gym.spaces.Tuple):
+    """What is left when every Dict and Tuple is taken apart, by dotted path; also those in another that are empty."""
+    if not isinstance(space, gym.spaces.Dict | gym.spaces.Tuple) or (path and not _parts(space)):
         return [(path, space)]
     return [leaf for name, part in _parts(space) for leaf in _leaves(part, f"{path}.{name}".lstrip("."))]
 
 
 def _kind_fault(what: str, space: gym.Space[Any]) -> str | None:
     leaves = _leaves(space)
-    odd = {path: type(leaf).__name__ for path, leaf in leaves if not isinstance(leaf, gym.spaces.Box)}
+    odd = {path: _kind(leaf) for path, leaf in leaves if not isinstance(leaf, gym.spaces.Box)}
     if "" in odd:
         return f"its {what} are {odd['']}; RMC takes a Box of numbers, or a Dict or Tuple of such boxes"
     if odd:
@@ -117,6 +120,12 @@ def _kind_fault(what: str, space: gym.Space[Any]) -> str | None:
     if not sum(math.prod(leaf.shape or ()) for _, leaf in leaves):
         return f"its {what} have shape {space.shape}: there are none; give at least one number"
     return None
+
+
+def _kind(space: Any) -> str:
+    """Its class's name; of a Box that is not gymnasium's, with the module that it is of."""
+    kind = type(space)
+    return f"{kind.__module__}.{kind.__name__}" if kind.__name__ == "Box" else kind.__name__
 
 
 def _image_fault(observation: gym.Space[Any]) -> str | None:
@@ -138,8 +147,10 @@ def _action_fault(action: gym.Space[Any]) -> str | None:
     if whole:
         return f"its actions are {whole[0]}; only continuous ones (a Box of floats) are learnt"
     low, high = bounds(action)
-    if not (np.abs([low, high]) < LARGEST_ACTION).all():
-        return "its action space is unbounded; give it a Box with the low and high that its actions really have"
+    largest = np.abs([low, high]).max()
+    if not largest < LARGEST_ACTION:
+        reach = f"reaches {largest:g}" if largest < np.inf else "is unbounded"
+        return f"its action space {reach}; give it a Box with the low and high that its actions really have"
     fixed = np.flatnonzero(low >= high).tolist()
     if fixed:
         return (

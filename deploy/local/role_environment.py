@@ -22,9 +22,11 @@ def start_process(
 ) -> subprocess.Popen[bytes]:
     """One that ends with this one, in a group of its own: Ctrl-C is for the supervisor alone. Raises OSError.
 
-    Beside ``variables`` it has this one's, but no secret, whoever set it here.
+    Beside ``variables`` it has this one's as they were before an environment was made, but no secret, whoever set it.
     """
-    inherited = {name: value for name, value in os.environ.items() if name not in (SECRET_VARIABLE, URL_VARIABLE)}
+    from rmc.common.env.process_state import our_variables  # numpy, without which `rmc --version` does
+
+    inherited = {name: value for name, value in our_variables().items() if name not in (SECRET_VARIABLE, URL_VARIABLE)}
     environment = {**inherited, **variables, PARENT_VARIABLE: str(os.getpid())}
     return subprocess.Popen(
         words, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment, process_group=0, pass_fds=pass_fds,

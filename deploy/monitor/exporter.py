@@ -72,8 +72,8 @@ class RunCollector(Collector):
         yield InfoMetricFamily("rmc_run", "The run.", about)
         for name, text, value in (
             ("total_steps", "Agent steps of the run's total.", status.total_steps),
-            ("evaluation_return", "Mean of the last evaluation.", last and last.return_mean),
-            ("evaluation_return_best", "Mean of the best one.", status.best and status.best.return_mean),
+            ("evaluation_return", "Mean of the last evaluation.", last.return_mean if last else None),
+            ("evaluation_return_best", "Mean of the best one.", status.best.return_mean if status.best else None),
         ):
             yield GaugeMetricFamily(f"rmc_{name}", text, value)
         silent = status.silent()

@@ -26,4 +26,4 @@ def _evaluation(status: RunStatus) -> str:
     if last is None:
         return f"eval {number(None)}"
     note = "" if last.is_complete else "incomplete; "
-    return f"eval {return_text(last.return_mean)} ({note}best {known_return(best and best.return_mean)})"
+    return f"eval {return_text(last.return_mean)} ({note}best {known_return(best.return_mean if best else None)})"

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from collections.abc import Iterator
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
@@ -101,11 +102,7 @@ def export_policy(command: run_options.Export) -> int:
 def inspect(command: run_options.Inspect) -> int:
     console = terminal(max(terminal().width, memory_picture.WIDTH))
     insight, memory, value = world_model_picture.inspect(command.run, command.checkpoint, command.out)
-    ahead = ", ".join(f"{share:.0%} {horizon} ahead" for horizon, share in insight.open_loop.items())
-    hardest = np.argsort(-insight.unexplained)[: world_model_picture.SHOWN]
-    worst = ", ".join(f"{i} ({insight.unexplained[i]:.0%})" for i in hardest)
-    console.print(f"unexplained of the observation's change: {ahead} (100% is a guess of no change)", soft_wrap=True)
-    console.print(f"worst dimensions one step ahead: {worst}")
+    console.print(*_unexplained(insight), sep="\n", soft_wrap=True)
     if value is None:
         needed = "--n-step 1, and episodes that terminate or outlast 3 / (1 - gamma) steps"
         console.print(f"critics are not compared with returns: that takes {needed}", soft_wrap=True)
@@ -116,6 +113,19 @@ def inspect(command: run_options.Inspect) -> int:
     console.print(*memory_picture.tables(memory), sep="\n")
     console.print(f"{command.out}", soft_wrap=True)
     return 0
+
+
+def _unexplained(insight: world_model_picture.Insight) -> Iterator[str]:
+    """What the world model leaves unexplained, in lines; that nothing was seen would read as a perfect prediction."""
+    ahead = ", ".join(f"{share:.0%} {horizon} ahead" for horizon, share in insight.open_loop.items())
+    if ahead:
+        yield f"unexplained of the observation's change: {ahead} (100% is a guess of no change)"
+    if 1 not in insight.open_loop:
+        yield "no change was seen from one step to the next; the world model is not judged by it"
+        return
+    hardest = np.argsort(-insight.unexplained)[: world_model_picture.SHOWN]
+    worst = ", ".join(f"{i} ({insight.unexplained[i]:.0%})" for i in hardest)
+    yield f"worst dimensions one step ahead: {worst}"
 
 
 def baseline(command: run_options.Baseline) -> int:

@@ -1,5 +1,6 @@
 """rmc check-env, as someone who brings an environment sees it."""
 
+import asyncio
 import re
 from dataclasses import replace
 from typing import Any
@@ -80,18 +81,77 @@ class Normed(Odd):
 
 
 class Spent(Odd):
-    """Has a level for one seed alone."""
+    """Has levels for small seeds alone."""
 
     def reset(self, *, seed: int | None = None, **options: Any) -> tuple[Any, dict[str, Any]]:
-        if seed == 1:
+        if seed is not None and seed >= 2**16:
             raise RuntimeError("no level has this seed")
         return super().reset(seed=seed, **options)
+
+
+class Drawn(Odd):
+    """Each has other sizes than the one before."""
+
+    made = 0
+
+    def __init__(self, what: str) -> None:
+        Drawn.made += 1
+        if what == "bounds":
+            self.action_space = gym.spaces.Box(-1.0, float(Drawn.made), (1,), np.float32)
+        else:
+            self.observation_space = gym.spaces.Box(-np.inf, np.inf, (2 + Drawn.made,), np.float32)
+
+    def _observation(self) -> Any:
+        return np.resize(super()._observation(), self.observation_space.shape)
+
+
+class Short(gym.Env[Any, Any]):
+    """Sound, but gives one array again and again, ends at once, or says so in a number: gymnasium reads more in it."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
+    action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def __init__(self, reused: bool, length: int, kind: Any) -> None:
+        self._seen, self._reused, self._length, self._kind = np.zeros(1), reused, length, kind
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self._steps = 0
+        return self._observation(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, Any, dict[str, Any]]:
+        self._steps += 1
+        return self._observation(), 1.0, False, self._kind(self._steps >= self._length), {}
+
+    def _observation(self) -> Any:
+        self._seen[:] = self.np_random.normal()
+        return self._seen if self._reused else self._seen.copy()
+
+
+class Vaster(Odd):
+    """Its numbers are nearly the largest that float32 holds."""
+
+    def _observation(self) -> Any:
+        return (3e38 * np.random.default_rng().uniform(-1.0, 1.0, 3)).astype(np.float32)
+
+
+class Panics(Odd):
+    """A Rust library's panic is no Exception, and is not caught as one."""
+
+    def step(self, action: Any) -> Any:
+        raise asyncio.CancelledError("panic")
+
+
+class Outside(Odd):
+    """Its numbers leave its space."""
+
+    observation_space = gym.spaces.Box(-1.0, 1.0, (3,), np.float32)
 
 
 def mended(**kwargs: Any) -> gym.Env[Any, Any]:
     """What gymnasium would complain of, but for a wrapper of the user's."""
     space = gym.spaces.Box(-1.0, 1.0, (3,), np.float32)
-    return gym.wrappers.TransformObservation(Odd(**kwargs), lambda o: (o * 0.0 + 0.5).astype(np.float32), space)
+    return gym.wrappers.TransformObservation(Outside(**kwargs), lambda o: (o * 0.0 + 0.5).astype(np.float32), space)
 
 
 class Rewarded(Odd):
@@ -112,9 +172,16 @@ for _name, _sizes in {
 gym.register("Odd-v0", entry_point=Odd)
 gym.register("Faint-v0", entry_point=Faint)
 gym.register("Constant-v0", entry_point=Still)
+gym.register("Outside-v0", entry_point=Outside)
 gym.register("Mended-v0", entry_point=mended)
 gym.register("Untold-v0", entry_point=Untold)
 gym.register("Spent-v0", entry_point=Spent)
+for _what in ("bounds", "observations"):
+    gym.register(f"Drawn-{_what}-v0", entry_point=Drawn, kwargs={"what": _what})
+for _name, _habits in {"Reused": (True, 9, bool), "Once": (False, 1, bool), "Counted": (False, 9, np.int64)}.items():
+    gym.register(f"{_name}-v0", Short, kwargs=dict(zip(("reused", "length", "kind"), _habits, strict=True)))
+gym.register("Vaster-v0", entry_point=Vaster)
+gym.register("Panics-v0", entry_point=Panics)
 gym.register("Late-v0", entry_point=Late)
 gym.register("Normed-v0", entry_point=Normed)
 gym.register("Unrewarded-v0", entry_point=Unrewarded)
@@ -148,7 +215,7 @@ def test_what_is_strange_is_noted_with_the_option_that_helps(capsys):
 
 
 def test_it_is_judged_with_the_users_own_wrappers(capsys):
-    assert "gymnasium says" in checked("Odd-v0", capsys, "--steps", "50")[1]
+    assert "gymnasium says" in checked("Outside-v0", capsys, "--steps", "50")[1]
     assert "gymnasium says" not in checked("Mended-v0", capsys, "--steps", "50")[1]
 
 
@@ -199,6 +266,43 @@ def test_a_fault_at_another_seed_is_one_line(capsys: pytest.CaptureFixture[str])
     assert status == 1
     assert "fault: the environment's reset raises RuntimeError: no level has this seed" in text
     assert "gave other observations" not in text
+
+
+@pytest.mark.parametrize(
+    ("what", "words"),
+    [
+        ("bounds", "the highest actions of a second one are [2.0], of the first [1.0]"),
+        ("observations", "observations of a second one are 4, of the first 3"),
+    ],
+)
+def test_sizes_that_differ_from_one_to_the_next_are_a_fault(
+    what: str, words: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Drawn, "made", 0)
+    status, text = checked(f"Drawn-{what}-v0", capsys, "--steps", "50")
+    assert status == 1
+    assert f"fault: {words}; give each the same\n" in text
+
+
+@pytest.mark.parametrize("env", ["Reused", "Once", "Counted"])
+def test_gymnasiums_notes_of_what_is_sound_are_left_out(env: str, capsys: pytest.CaptureFixture[str]) -> None:
+    status, text = checked(f"{env}-v0", capsys, "--steps", "50")
+    assert status == 0
+    for words in ("non-deterministic", "truncates after 1 step", "gave other observations"):
+        assert words not in text
+
+
+def test_numbers_near_the_largest_are_noted_without_a_warning(capsys: pytest.CaptureFixture[str], recwarn: Any) -> None:
+    status, text = checked("Vaster-v0", capsys, "--steps", "50")
+    assert status == 0
+    assert re.search(r"observations reach [23]\.?\d*e\+38; scale them", text)
+    assert not [str(one.message) for one in recwarn if one.category is RuntimeWarning]
+
+
+def test_what_is_no_exception_is_one_line_too(capsys: pytest.CaptureFixture[str]) -> None:
+    status, text = checked("Panics-v0", capsys, "--steps", "50")
+    assert status == 1
+    assert "fault: the environment's step raises CancelledError: panic (test_env_check.py, line " in text
 
 
 def test_a_second_one_is_tried_with_an_action_that_the_first_one_stood(capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 import time
@@ -9,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import psutil
 import pytest
 from imageio_ffmpeg import count_frames_and_secs, get_ffmpeg_exe
@@ -19,9 +21,10 @@ from rmc.analysis.video import _follow
 from rmc.cli import main
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.make import make_env
-from rmc.common.errors import ConfigError, RmcError
+from rmc.common.errors import ConfigError, EnvFault, RmcError
 from rmc.common.whole_file import temporary_path
 from tests.command import complaint, rmc
+from tests.habits import Draws
 from tests.runs import AGENTS, make_run
 
 MOVES = """
@@ -93,6 +96,22 @@ def test_it_lasts_as_long_as_the_episode_whatever_is_repeated(tmp_path: Path) ->
         policy, out = load_policy(folder.path), tmp_path / f"{repeat}.mp4"
         video.record(policy, config, 0, out, length)
         assert frames(out) == (length, pytest.approx(1.2, abs=0.1))
+
+
+@pytest.mark.parametrize("said", [None, 0, "25", np.float32(12.5), "fast", -5, np.nan, np.inf, [30]], ids=str)
+def test_frames_a_second_are_a_positive_number_or_a_line(said: Any, tmp_path: Path, monkeypatch) -> None:
+    config = EnvConfig("tests.habits:Draws-v0", env_kwargs={"picture": "sound"})
+    folder = make_run(tmp_path / "run", AGENTS["robust"], config.id, env_kwargs=config.env_kwargs)
+    policy, out = load_policy(folder.path), tmp_path / "film.mp4"
+    monkeypatch.setitem(Draws.metadata, "render_fps", said)
+    if said in (None, 0, "25", 12.5):
+        video.record(policy, config, 0, out)
+        assert frames(out) == (12, pytest.approx(12 / float(said or 30), abs=0.1))
+    else:
+        words = re.escape(f'the environment\'s metadata["render_fps"] is {said!r}; give frames a second')
+        with pytest.raises(EnvFault, match=f"^{words}$"):
+            video.record(policy, config, 0, out)
+        assert not out.exists()
 
 
 def test_one_with_a_limit_is_filmed_to_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -109,11 +109,18 @@ def test_an_episode_that_never_ends_is_looked_at_for_a_while(
     torch.testing.assert_close(short.reward, 0.5 * plain.reward)  # as the world model has learnt it
 
 
-def test_a_horizon_at_which_nothing_was_seen_has_no_share(config: RunConfig, tmp_path: Path) -> None:
+def test_a_horizon_at_which_nothing_was_seen_has_no_share(
+    config: RunConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Zero would read as a perfect prediction."""
     blind = dataclasses.replace(config, env=dataclasses.replace(config.env, flicker=1.0))
     folder = run_of(tmp_path / "run", blind)
     assert inspect(folder.path, "latest", tmp_path / "out.png")[0].open_loop == {}
+    assert main.run(["inspect", str(folder.path), "--out", str(tmp_path / "seen.png")]) == 0
+    output = capsys.readouterr().out
+    assert output.startswith("no change was seen from one step to the next; the world model is not judged by it\n")
+    assert "unexplained" not in output
+    assert "worst dimensions" not in output
 
 
 def test_a_model_without_grounding_has_nothing_to_show(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

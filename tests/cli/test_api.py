@@ -272,15 +272,19 @@ def test_without_a_folder_the_result_names_the_one_that_was_made(
     assert rmc.resume(result["run_dir"])["env_steps"] == result["env_steps"] == 600
 
 
-def test_what_torch_draws_is_the_callers_also_meanwhile(tmp_path: Path) -> None:
+def test_what_torch_draws_is_the_callers_also_meanwhile_in_its_dtype(tmp_path: Path) -> None:
     torch.set_flush_denormal(False)
     torch.manual_seed(123)
     drawn: list[float] = []
     config = dataclasses.replace(CONFIG, total_steps=600)
-    rmc.train(config, tmp_path / "run", launcher="lockstep", callback=lambda _: drawn.append(torch.rand(1).item()))
-    drawn.append(torch.rand(1).item())
-    torch.manual_seed(123)
-    assert drawn == [torch.rand(1).item() for _ in drawn]
+    torch.set_default_dtype(torch.float64)
+    try:
+        rmc.train(config, tmp_path / "run", launcher="lockstep", callback=lambda _: drawn.append(torch.rand(1).item()))
+        drawn.append(torch.rand(1).item())
+        torch.manual_seed(123)
+        assert drawn == [torch.rand(1).item() for _ in drawn]
+    finally:
+        torch.set_default_dtype(torch.float32)
     assert (torch.tensor(1e-40) * 1).item() > 0  # a denormal
 
 

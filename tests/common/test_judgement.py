@@ -1,5 +1,6 @@
 """What a user's environment may give and do, and that every command says the same of it."""
 
+import asyncio
 import dataclasses
 import logging
 from collections.abc import Iterator
@@ -92,6 +93,35 @@ def test_what_a_step_gives_is_judged(part: int, value: Any, says: str) -> None:
     with pytest.raises(EnvFault) as caught:
         env.step(np.zeros(2, np.float32))
     assert str(caught.value) == f"the environment's {says}"
+
+
+def test_a_mask_is_not_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(habits.Slide, "seen", lambda _: np.ma.masked_array([1.0, 2.0, 3.0], [True, False, False]))
+    with pytest.raises(EnvFault, match=r'is a masked array; return zeros where it masks, and say so in info\["missing'):
+        make_env(habit("Slide")).reset()
+
+
+@pytest.mark.parametrize("error", [SystemExit, asyncio.CancelledError])  # or a Rust library's panic
+def test_whatever_a_step_raises_is_its_fault(error: type[BaseException], monkeypatch: pytest.MonkeyPatch) -> None:
+    def step(*_: Any) -> Any:
+        raise error("panic")
+
+    monkeypatch.setattr(habits.Slide, "step", step)
+    env = make_env(habit("Slide"))
+    env.reset()
+    with pytest.raises(EnvFault, match=rf"^the environment's step raises {error.__name__}: panic \(test_judgement"):
+        env.step(np.zeros(2, np.float32))
+
+
+def test_ctrl_c_in_a_step_is_nobodys_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    def step(*_: Any) -> Any:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(habits.Slide, "step", step)
+    env = make_env(habit("Slide"))
+    env.reset()
+    with pytest.raises(KeyboardInterrupt):
+        env.step(np.zeros(2, np.float32))
 
 
 @pytest.mark.parametrize(("part", "value"), [(1, [0.5]), (1, 1), (1, True), (2, [0]), (4, {"missing": 0})])

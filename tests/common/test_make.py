@@ -53,7 +53,18 @@ def longer() -> gym.Env[Any, Any]:
     return TransformObservation(InvertedPendulumEnv(), lambda observation: np.append(observation, 1.0), space)
 
 
+def limited() -> gym.Env[Any, Any]:
+    """Cut off at 20 steps by a wrapper of the user's own."""
+    return gym.wrappers.TimeLimit(OddSpaces(VECTOR, Box(-1.0, 1.0, (2,))), 20)
+
+
+class OlderBox(gym.Space[Any]):
+    """Of gym, before it was gymnasium."""
+
+
+OlderBox.__name__, OlderBox.__module__ = "Box", "gym.spaces.box"
 gym.register("Longer-v0", entry_point=longer)
+gym.register("LimitedWithin-v0", entry_point=limited)
 
 
 def odd(name: str, observation: gym.Space[Any], action: gym.Space[Any]) -> EnvConfig:
@@ -154,6 +165,35 @@ def test_a_registered_time_limit_is_a_whole_number(limit: Any, monkeypatch: pyte
     first_env(replace(config, time_limit=7)).close()
 
 
+def test_a_limit_of_the_users_own_wrapper_is_known() -> None:
+    within = EnvConfig("LimitedWithin-v0")
+    for config, steps in (
+        (within, 20), (replace(within, time_limit=1000), 20), (replace(within, time_limit=7), 7),
+        (replace(within, action_repeat=3), 7),
+    ):  # fmt: skip
+        assert env_layout(config).time_limit == steps
+        env = make_env(replace(config, delay=steps - 1))
+        env.reset(seed=0)
+        assert [env.step(np.zeros(2, np.float32))[3] for _ in range(steps)] == [False] * (steps - 1) + [True]
+        with pytest.raises(ConfigError, match=rf"^--delay={steps}: an episode ends after {steps} steps; take fewer$"):
+            make_env(replace(config, delay=steps))
+
+
+def test_one_that_is_refused_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    closed: list[Any] = []
+    monkeypatch.setattr(OddSpaces, "close", lambda self: closed.append(self))
+    for config in (EnvConfig("LimitedWithin-v0", delay=20), odd("Whole-v0", VECTOR, Box(0, 3, (2,), np.int64))):
+        with pytest.raises(ConfigError):
+            make_env(config)
+        assert len(closed) == 1
+        closed.clear()
+
+
+def test_numbers_of_another_byte_order_are_numbers() -> None:
+    layout = env_layout(odd("Foreign-v0", Box(-1.0, 1.0, (3,), np.dtype(">f4")), Box(-1.0, 1.0, (2,))))
+    assert layout.observations[0].dtype == "float32"
+
+
 def test_actions_are_stretched_and_clipped() -> None:
     low, high = np.array([-2.0, 0.0]), np.array([2.0, 10.0])
     env = make_env(odd("Stretched-v0", VECTOR, Box(low, high, dtype=np.float64)))
@@ -221,7 +261,14 @@ def test_the_outermost_actions_are_within_the_bounds(bound: float, dtype: type) 
         (EnvConfig("HalfCheetah-v5", time_limit=-1), "--time-limit=-1"),
         (odd("Empty-v0", Box(0, 1, (0,), np.float32), VECTOR), "its observations have shape (0,)"),
         (odd("Unbounded-v0", VECTOR, Box(-np.inf, np.inf, (2,))), "action space is unbounded"),
-        (odd("Endless-v0", VECTOR, Box(-3e38, 3e38, (2,))), "action space is unbounded"),
+        (odd("Endless-v0", VECTOR, Box(-3e38, 3e38, (2,))), "action space reaches 3e+38; give it a Box with the low"),
+        (
+            odd("Hollow-v0", gym.spaces.Dict(a=VECTOR, b=gym.spaces.Dict()), VECTOR),
+            "observations {'b': 'Dict'} are no",
+        ),
+        (odd("Idle-v0", VECTOR, gym.spaces.Tuple([VECTOR, gym.spaces.Tuple([])])), "of its actions {'1': 'Tuple'} are"),
+        (odd("None-v0", gym.spaces.Dict(), VECTOR), "its observations have shape None: there are none"),
+        (odd("Older-v0", OlderBox(), VECTOR), "its observations are gym.spaces.box.Box; RMC takes a Box of numbers"),
         (odd("Whole-v0", VECTOR, Box(0, 3, (2,), np.int64)), "actions are int64"),
         (EnvConfig("json:Nothing-v0"), "json/__init__.py) registers no Nothing-v0"),
         (odd("Multi-v0", VECTOR, gym.spaces.MultiDiscrete([2, 2])), "actions are MultiDiscrete"),
@@ -256,6 +303,15 @@ def test_an_unknown_id_is_no_module_of_the_folder(tmp_path: Path, monkeypatch: p
         ("x = 1\nx / 0", "broken cannot be imported: ZeroDivisionError: division by zero (broken.py, line 2)"),
         ("import json\njson.loads('x')", "Expecting value: line 1 column 1 (char 0) (broken.py, line 2)"),
         ("import sys\nsys.exit('no licence')", "broken cannot be imported: SystemExit: no licence (broken.py, line 2)"),
+        (
+            "import asyncio\nraise asyncio.CancelledError('panic')",
+            "broken cannot be imported: CancelledError: panic (broken.py, line 2)",
+        ),
+        (
+            "import asyncio, gymnasium\nclass Env(gymnasium.Env):\n  def __init__(self): raise asyncio.CancelledError\n"
+            "gymnasium.register('Broken-v0', entry_point=Env)",
+            "the environment cannot be made: CancelledError (broken.py, line 3)",
+        ),
         (
             "import gymnasium\nclass Env(gymnasium.Env):\n  def __init__(self):\n    self.x\n"
             "gymnasium.register('Broken-v0', entry_point=Env)",

@@ -1,6 +1,10 @@
 """What an environment changes of its process is its own: our code finds the process as it was."""
 
+import io
 import os
+import signal
+import subprocess
+import sys
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -16,22 +20,50 @@ from rmc.common.env.make import make_env
 from rmc.common.env.process_state import ApartCall, ProcessState, torch_as_imported
 from rmc.learner.precision import set_precision
 from tests import meddling_env
-from tests.command import rmc
+from tests.command import complaint, rmc
 from tests.counting_env import CountingEnv
 
 
 @pytest.mark.parametrize("when", ["early", "late"])
 @pytest.mark.parametrize("habit", meddling_env.HABITS)
 def test_both_find_the_process_as_they_left_it(habit: str, when: str) -> None:
-    before = ProcessState.read()
+    before = ProcessState.read(), meddling_env.as_it_is()
     env = make_env(EnvConfig(f"tests.meddling_env:Meddling-{habit}-{when}-v0"))
     for seed in range(2):
         env.reset(seed=seed)
-        assert ProcessState.read() == before
+        assert (ProcessState.read(), meddling_env.as_it_is()) == before
         env.step(np.zeros(2, np.float32))  # it asserts that it finds its own
-        assert ProcessState.read() == before
+        assert (ProcessState.read(), meddling_env.as_it_is()) == before
     env.close()
-    assert ProcessState.read() == before
+    assert (ProcessState.read(), meddling_env.as_it_is()) == before
+
+
+def test_how_a_child_ended_is_known_whatever_an_environment_ignores() -> None:
+    pipes = signal.getsignal(signal.SIGPIPE)
+    with ApartCall("Mine-v0", "reset", 1.0):
+        signal.signal(signal.SIGCHLD, signal.SIG_IGN)
+        signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+    assert subprocess.run(["false"], check=False).returncode == 1
+    assert signal.getsignal(signal.SIGPIPE) == pipes
+
+
+def test_a_refusal_is_printed_whatever_its_module_does_with_the_streams(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "quiet.py").write_text(
+        "import io, sys, gymnasium\nsys.stdout = sys.stderr = io.StringIO()\n"
+        "from gymnasium.envs.classic_control import CartPoleEnv\ngymnasium.register('Quiet-v0', CartPoleEnv)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    assert "actions are Discrete" in complaint(["check-env", "quiet:Quiet-v0"], capsys)
+
+
+def test_what_it_has_not_changed_it_finds_as_it_is_now(monkeypatch: pytest.MonkeyPatch) -> None:
+    make_env(EnvConfig("tests.meddling_env:Meddling-dtype-early-v0")).close()
+    ours = io.StringIO()
+    monkeypatch.setattr("sys.stdout", ours)
+    with ApartCall("tests.meddling_env:Meddling-dtype-early-v0", "reset", 1.0):
+        assert sys.stdout is ours
 
 
 def test_what_one_environment_has_changed_another_does_not_find() -> None:
@@ -73,11 +105,14 @@ def test_a_callers_rounding_comes_back_where_a_gpu_learned() -> None:
 
 def test_what_other_threads_change_meanwhile_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(".")  # back at the end
+    monkeypatch.setattr("sys.stdout", sys.stdout)
+    theirs = io.StringIO()
     with torch_as_imported(), ThreadPoolExecutor(1) as other:
         other.submit(os.chdir, tmp_path).result()
         other.submit(torch.set_default_dtype, torch.float64).result()
+        other.submit(setattr, sys, "stdout", theirs).result()
     try:
-        assert (os.getcwd(), torch.get_default_dtype()) == (str(tmp_path), torch.float64)
+        assert (os.getcwd(), torch.get_default_dtype(), sys.stdout) == (str(tmp_path), torch.float64, theirs)
     finally:
         torch.set_default_dtype(torch.float32)
 
@@ -94,6 +129,22 @@ def test_of_two_at_once_the_last_gives_the_callers_dtype_back() -> None:
         assert torch.get_default_dtype() == torch.float64
     finally:
         torch.set_default_dtype(torch.float32)
+
+
+def test_of_two_at_once_both_give_the_callers_threads_back() -> None:
+    """Though the second begins while the first plays, with one."""
+    torch.set_num_threads(2)
+    try:
+        first, second = torch_as_imported(), torch_as_imported()
+        first.__enter__()
+        torch.set_num_threads(1)
+        second.__enter__()
+        first.__exit__(None, None, None)
+        torch.set_num_threads(1)
+        second.__exit__(None, None, None)
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(1)
 
 
 class Homeless(CountingEnv):
@@ -125,7 +176,7 @@ def test_check_env_names_what_is_changed(capsys: pytest.CaptureFixture[str]) -> 
         "note: it changes", "torch's default dtype (torch.float64)", "torch's grad mode (False)",
         "the working folder (/",
         "torch's threads (3)", "numpy's error state", "torch's default device (meta)", "the handlers of signals",
-        "the random generators that all share",
+        "sys.stdout and sys.stderr", "the setup of logging", "the random generators that all share",
     ):  # fmt: skip
         assert words in output
     ApartCall.changed, ApartCall.env_states = {}, {}

@@ -11,6 +11,7 @@ from typing import Any
 import psutil
 import pytest
 
+from rmc.common.env.process_state import ApartCall
 from rmc.common.errors import RoleDied
 from rmc.common.process.role import TERMINATED_STATUS
 from rmc.common.process.watchdog import HUNG_STATUS
@@ -36,6 +37,15 @@ def tend_until(role: RoleProcess, seconds: float = 5.0) -> None:
     wait_until(lambda: role.tend() or role.finished, seconds, pause=0.01)
 
 
+def variables_of_a_role(quick: Path, **variables: str) -> dict[str, str]:
+    """What a role is started with, these among them."""
+    Path(supervisor.sys.executable).write_text(f"#!/bin/sh\nenv > {quick}/told\n")
+    role = RoleProcess(RoleCommand("learner", ("learner",), ends=True), variables, quick)
+    role.start()
+    tend_until(role)
+    return dict(row.split("=", 1) for row in (quick / "told").read_text().splitlines() if "=" in row)
+
+
 def test_the_learner_may_end(quick: Path) -> None:
     role = RoleProcess(RoleCommand("learner", ("learner",), ends=True), {}, quick)
     role.start()
@@ -45,14 +55,28 @@ def test_the_learner_may_end(quick: Path) -> None:
 
 def test_what_was_exported_for_one_role_is_not_passed_on(quick: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each has its own Redis user, and its secret from a file; the shell that began a cluster may know others."""
-    Path(supervisor.sys.executable).write_text(f"#!/bin/sh\nenv > {quick}/told\n")
     for name in ("RMC_SECRET", "RMC_REDIS_URL", "ANOTHER"):
         monkeypatch.setenv(name, "exported")
-    role = RoleProcess(RoleCommand("learner", ("learner",), ends=True), {"RMC_REDIS_URL": "own"}, quick)
-    role.start()
-    tend_until(role)
-    variables = dict(row.split("=", 1) for row in (quick / "told").read_text().splitlines() if "=" in row)
+    variables = variables_of_a_role(quick, RMC_REDIS_URL="own")
     assert (variables.get("RMC_SECRET"), variables["RMC_REDIS_URL"], variables["ANOTHER"]) == (None, "own", "exported")
+
+
+def test_what_an_environment_sets_for_itself_is_not_passed_on(quick: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Roles that play import its module; a learner is to see its GPU."""
+    monkeypatch.setattr(ApartCall, "variables", {})
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
+    monkeypatch.setenv("NOT_FOR_IT", "ours")
+    monkeypatch.delenv("ITS_OWN", raising=False)
+    for gpu in ("1", ""):
+        with ApartCall("Mine-v0", "make", 1.0):
+            os.environ.update(CUDA_VISIBLE_DEVICES=gpu, ITS_OWN="theirs")
+            os.environ.pop("NOT_FOR_IT", None)
+    with ApartCall("Mine-v0", "reset", 1.0):
+        assert (os.environ["CUDA_VISIBLE_DEVICES"], os.environ["ITS_OWN"]) == ("", "theirs")
+    told = variables_of_a_role(quick)
+    assert (told["CUDA_VISIBLE_DEVICES"], told["NOT_FOR_IT"], told.get("ITS_OWN")) == ("0", "ours", None)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2")  # the caller's, since
+    assert variables_of_a_role(quick)["CUDA_VISIBLE_DEVICES"] == "2"
 
 
 def test_a_role_starts_where_the_working_folder_is_gone(quick: Path, monkeypatch: pytest.MonkeyPatch) -> None:
