@@ -70,6 +70,8 @@ def rollouts(run: ReportRun, checkpoint: str) -> Medium:
         return Medium(run.name, note=f"No world-model rollouts: {_why(error)}.")
     ahead = ", ".join(f"{share:.0%} at {horizon}" for horizon, share in insight.open_loop.items())
     note = f"unexplained of the observation's change, by steps ahead: {ahead} (100% is a guess of no change)"
+    if not ahead:
+        note = world_model_picture.NOTHING_SEEN
     return Medium(run.name, data_uri(picture.getvalue(), "image/png"), note)
 
 

@@ -34,6 +34,7 @@ from rmc.learner.losses import model_error
 
 HORIZONS = (1, 5, 15)  # steps ahead
 SHOWN, SHOWN_STEPS = 4, 100  # dimensions in the picture, those that change the most, and from when on how long
+NOTHING_SEEN = "no change was seen from one step to the next; the world model is not judged by it"
 
 
 @dataclass(frozen=True)

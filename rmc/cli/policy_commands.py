@@ -121,7 +121,7 @@ def _unexplained(insight: world_model_picture.Insight) -> Iterator[str]:
     if ahead:
         yield f"unexplained of the observation's change: {ahead} (100% is a guess of no change)"
     if 1 not in insight.open_loop:
-        yield "no change was seen from one step to the next; the world model is not judged by it"
+        yield world_model_picture.NOTHING_SEEN
         return
     hardest = np.argsort(-insight.unexplained)[: world_model_picture.SHOWN]
     worst = ", ".join(f"{i} ({insight.unexplained[i]:.0%})" for i in hardest)
