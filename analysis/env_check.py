@@ -29,9 +29,9 @@ from rmc.deploy.run.config import WindowConfig
 from rmc.deploy.run.env_sizes import env_sizes, layout_sizes
 from rmc.deploy.run.memory_reach import format_reach
 
-BESIDE_THE_POINT = (  # of vectors, stretched actions, and what watches the environment
+BESIDE_THE_POINT = (  # of vectors, stretched actions, what watches the environment, and what is judged better below
     "is -infinity", "is infinity", "symmetric and normalized", "different from the unwrapped version",
-    "is non-deterministic as", "truncates after 1 step",  # which what follows judges, too, and better
+    "is non-deterministic as", "truncates after 1 step",
 )  # fmt: skip
 REPEATED_STEPS = 50  # played twice from one seed
 LARGE_REWARD = 100.0  # mean size of a step's reward from which the critics start far from their target

@@ -216,9 +216,10 @@ def _evaluations(records: Iterable[dict[str, Any]]) -> list[Evaluation]:
             played.append(record)
     evaluations: list[Evaluation] = []
     times = _between([record["time"] for record in played], walls)
-    for record, wall in zip(played, times, strict=True):
+    places = _between([record["eval_update"] for record in played], steps)
+    for record, wall, place in zip(played, times, places, strict=True):
         updates, own = record["eval_update"], _says(record, "evaluator", "eval_env_steps")
-        at = int(record["eval_env_steps"] if own else _between([updates], steps)[0])  # older runs say the update alone
+        at = int(record["eval_env_steps"] if own else place)  # older runs say the update alone
         while evaluations and evaluations[-1].env_steps >= at:
             evaluations.pop()
         evaluations.append(Evaluation(at, updates, wall, record["eval_return_mean"], record["eval_return_std"]))

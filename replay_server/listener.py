@@ -3,6 +3,8 @@
 import errno
 import os
 import socket
+import stat
+from contextlib import suppress
 from pathlib import Path
 
 from rmc.common.errors import ConfigError
@@ -34,8 +36,9 @@ def listen(address: str) -> tuple[socket.socket, Path | None, str]:
 
 
 def _listen_unix(path: Path) -> socket.socket:
-    if path.is_socket():  # a killed server's; the ring's lock keeps a living one's safe
-        path.unlink()
+    with suppress(FileNotFoundError):
+        if stat.S_ISSOCK(os.lstat(path).st_mode):  # a killed server's; the ring's lock keeps a living one's safe
+            path.unlink()
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         mask = os.umask(0o177)

@@ -135,6 +135,7 @@ def no_environment_has_changed_the_process(monkeypatch: pytest.MonkeyPatch) -> N
     """One that changed it in an earlier test is forgotten."""
     monkeypatch.setattr(ApartCall, "env_states", {})
     monkeypatch.setattr(ApartCall, "changed", {})
+    monkeypatch.setattr(ApartCall, "variables", {})
 
 
 @pytest.fixture(autouse=True)

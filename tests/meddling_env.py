@@ -38,8 +38,7 @@ HABITS = {
 def as_it_is() -> tuple[Any, ...]:
     return (
         os.getcwd(), np.geterr(), torch.get_default_dtype(), torch.is_grad_enabled(), torch.get_num_threads(),
-        torch.get_default_device(), sys.stdout, sys.stderr, logging.getLogger().level,
-        logging.getLogger("rmc.common.env.make").disabled,
+        torch.get_default_device(),
     )  # fmt: skip
 
 

@@ -9,8 +9,10 @@ from typing import Any, TypeVar
 
 from rmc.common.errors import EnvFault, RmcError, one_line
 
-RAISED = (Exception, SystemExit)  # what a user's code may raise; a module that calls sys.exit ends nobody else
-PASSED_ON = (KeyboardInterrupt, GeneratorExit)  # nobody's fault; all else is theirs, a Rust library's panic too
+PASSED_ON = (
+    KeyboardInterrupt,
+    GeneratorExit,
+)  # nobody's fault; all else is theirs, also a call of sys.exit and a Rust library's panic
 INSTALLED = {"site-packages", "dist-packages"}
 STANDARD_LIBRARY = sysconfig.get_path("stdlib")
 ResultT = TypeVar("ResultT")

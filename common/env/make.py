@@ -17,7 +17,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from rmc.common.env.config import EnvConfig, check_env_config
 from rmc.common.env.describe import agent_steps, layout_of, structure, visible_slice
-from rmc.common.env.faults import PASSED_ON, RAISED, call_env, describe_error
+from rmc.common.env.faults import PASSED_ON, call_env, describe_error
 from rmc.common.env.layout import EnvLayout
 from rmc.common.env.missing import DropSensors, Flicker
 from rmc.common.env.privileged import Privileged
@@ -45,14 +45,13 @@ def make_env(config: EnvConfig, render: bool = False, privileged: bool = False) 
         spec = find_spec(config.id)
         limit = config.time_limit or _registered_limit(config.id, spec.max_episode_steps)
         made = _make(spec, config, render)
-        own = made.spec.max_episode_steps if made.spec else None  # of a wrapper of the user's
-        limit = min(filter(None, (limit, own)), default=None)
+        own = made.spec.max_episode_steps if made.spec else None  # of a wrapper of the user's, which may go on past it
     env = WatchedEnv(made, config.id, config.env_timeout)
     try:
-        _check_fit(env, config, limit)
+        _check_fit(env, config, limit or own)
     except ConfigError:
-        with suppress(*RAISED):
-            env.close()
+        with suppress(EnvFault):
+            call_env("close", env.close)
         raise
     return _as_seen(env, config, limit, privileged)
 

@@ -17,6 +17,7 @@ from rmc.common.process.watchdog import EnvCall
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGCHLD, signal.SIGPIPE)
 OURS = "rmc."  # with which our loggers' names begin
+STAY_OURS = ("handlers", "streams", "logs", "random")  # which an environment does not find again as it left them
 OF_TORCH = ("dtype", "gradients", "threads", "device")  # a process's state that is torch's
 
 
@@ -131,15 +132,21 @@ def _go(folder: str | None) -> None:
         os.chdir(folder or "")
 
 
+def _is_main() -> bool:
+    """Elsewhere no handler can be set, by nobody; and what others change of streams and logging is the program's."""
+    return threading.current_thread() is threading.main_thread()
+
+
 def _catch(handlers: tuple[Any, ...]) -> None:
-    if threading.current_thread() is threading.main_thread():  # elsewhere none can be set, by nobody
+    if _is_main():
         for number, handler in zip(SIGNALS, handlers, strict=True):
             if handler is not None:  # not set from Python
                 signal.signal(number, handler)
 
 
 def _write_to(streams: tuple[Any, Any]) -> None:
-    sys.stdout, sys.stderr = streams
+    if _is_main():
+        sys.stdout, sys.stderr = streams
 
 
 def _logs() -> tuple[Any, ...]:
@@ -150,6 +157,8 @@ def _logs() -> tuple[Any, ...]:
 
 
 def _log_by(logs: tuple[Any, ...]) -> None:
+    if not _is_main():
+        return
     root, (level, handlers, disabled, off) = logging.getLogger(), logs
     root.setLevel(level)
     root.handlers[:] = handlers
@@ -168,7 +177,7 @@ def _our_loggers(known: int) -> list[logging.Logger]:
 class ApartCall(EnvCall):
     """A call in which the process is as the environment has left it; afterwards it is as it was before the call.
 
-    A step is not looked at for changes of its own. Signals' handlers stay ours.
+    A step is not looked at for changes of its own. Signals' handlers, streams and logging stay ours.
     """
 
     env_states: dict[str, dict[str, Any]] = {}  # noqa: RUF012 - by an environment's module: what differs from ours
@@ -207,14 +216,15 @@ class ApartCall(EnvCall):
         ApartCall.changed |= changed
         ours.install(now)
         ApartCall.env_states.pop(self._module(), None)
-        if own := {name: value for name, value in changed.items() if name not in ("handlers", "random")}:
+        if own := {name: value for name, value in changed.items() if name not in STAY_OURS}:
             ApartCall.env_states[self._module()] = own
 
     def _note_variables(self, before: dict[str, str]) -> None:
         for name in before.keys() | os.environ.keys():
             was, now = before.get(name), os.environ.get(name)
             if was != now:
-                ApartCall.variables[name] = ApartCall.variables.get(name, (was, now))[0], now
+                first, left = ApartCall.variables.get(name, (was, was))
+                ApartCall.variables[name] = (first if was == left else was), now  # or the program has set it since
 
 
 def our_variables() -> dict[str, str]:

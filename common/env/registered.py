@@ -13,7 +13,7 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec, find_highest_version
 
-from rmc.common.env.faults import PASSED_ON, RAISED, describe_error
+from rmc.common.env.faults import PASSED_ON, describe_error
 from rmc.common.errors import ConfigError
 from rmc.common.extra import how_to_install
 
@@ -105,5 +105,7 @@ def _import_tasks(env_id: str, packages: tuple[str, str], module: str, how: str)
         warnings.simplefilter("ignore")  # shimmy looks for a screen, and says so where there is none
         try:
             importlib.import_module(module)
-        except RAISED as error:  # of dm_control, where MUJOCO_GL names no renderer
+        except PASSED_ON:
+            raise
+        except BaseException as error:  # of dm_control, where MUJOCO_GL names no renderer
             raise ConfigError("ENV", env_id, f"{module} cannot be imported: {describe_error(error)}") from None

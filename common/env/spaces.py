@@ -11,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from rmc.common.env.faults import RAISED
+from rmc.common.env.faults import PASSED_ON
 from rmc.common.env.layout import Part
 from rmc.common.errors import EnvFault
 
@@ -55,7 +55,7 @@ def vector(space: gym.Space[Any], value: Any) -> NDArray[np.float32]:
 
 
 def _numbers(box: gym.Space[Any], value: Any) -> NDArray[np.float32]:
-    if isinstance(value, np.ma.MaskedArray):  # whose mask would be lost
+    if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):  # the mask would be lost
         fix = 'return zeros where it masks, and say so in info["missing"]'
         raise EnvFault(f"the environment's observation is a masked array; {fix}")
     numbers = array("observation", value, "an array of numbers")
@@ -69,7 +69,9 @@ def array(name: str, value: Any, expected: str) -> NDArray[Any]:
     """What is of numbers as an array; no copy. Raises EnvFault with what is ``expected`` where it is none."""
     try:
         numbers = np.asarray(value)
-    except RAISED:  # a list whose rows differ, or a tensor on another device
+    except PASSED_ON:
+        raise
+    except BaseException:  # a list whose rows differ, or a tensor on another device
         numbers = np.empty(0, object)
     if numbers.dtype.kind not in NUMBERS:
         raise EnvFault(f"the environment's {name} is {reprlib.repr(value)}; return {expected}")

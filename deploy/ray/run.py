@@ -150,9 +150,9 @@ class ClusterRun:
     def stop(self, reason: str) -> None:
         """Ask every role to end, and wait until the learner's last checkpoint is on the head."""
         self.hosts.tell_stop()
-        deadline = time.monotonic() + STOP_SECONDS + self._patience(0.0)
+        deadline, asked = time.monotonic() + STOP_SECONDS + self._patience(0.0), False
         while time.monotonic() < deadline and not self.hosts.all_ended():
-            asked_to_stop(self.bus, reason)  # again and again: a Redis may come back without it
+            asked = asked or asked_to_stop(self.bus, reason)  # a Redis that is away is asked again
             time.sleep(TICK_SECONDS)
         self._redis.end()
 

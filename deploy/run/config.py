@@ -170,7 +170,9 @@ def to_registration(config: RunConfig) -> bytes:
 def from_registration(text: bytes) -> RunConfig:
     """The config again. Raises ConfigError."""
     raw = _read(text)
-    layout, _ = (raw.pop("layout", None), raw.pop("start", None)) if isinstance(raw, dict) else (None, None)
+    if isinstance(raw, dict):
+        raw.pop("start", None)
+    layout: Any = raw.pop("layout", None) if isinstance(raw, dict) else None
     config = from_dict(RunConfig, raw, "config.json ")
     config.__dict__["layout"] = from_dict(EnvLayout, layout, "layout ")  # where the cached property keeps it
     return config

@@ -408,7 +408,7 @@ def test_stats_and_list_as_json(capsys: pytest.CaptureFixture[str], tmp_path: Pa
     assert main.run(["stats", str(run.path), "--json"]) == 0
     value = json.loads(capsys.readouterr().out)
     assert (value["state"], value["env"], value["env_steps"], value["elapsed_s"]) == ("stopped", PENDULUM, 700, 9.0)
-    evaluation = {"return_mean": 4.5, "return_std": 0.5, "update": 5, "env_steps": 600}
+    evaluation = {"return_mean": 4.5, "return_std": 0.5, "update": 5, "env_steps": 600, "is_complete": True}
     assert value["last_evaluation"] == value["best_evaluation"] == evaluation
     assert value["roles"]["replay"] == records[0] | {"replay_ratio": None}  # which JSON cannot say
     assert (value["eta_s"], value["result"]) == (None, None)

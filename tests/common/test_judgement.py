@@ -9,10 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium.spaces import Box
 
 from rmc.common.env import wrappers
 from rmc.common.env.config import EnvConfig, read_kwargs, write_kwargs
 from rmc.common.env.make import env_layout, make_env
+from rmc.common.env.spaces import vector
 from rmc.common.errors import ConfigError, EnvFault
 from tests import habits
 
@@ -96,6 +98,7 @@ def test_what_a_step_gives_is_judged(part: int, value: Any, says: str) -> None:
 
 
 def test_a_mask_is_not_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert vector(Box(-5.0, 5.0, (2,)), np.ma.masked_array([1.0, 2.0])).tolist() == [1.0, 2.0]  # none masks anything
     monkeypatch.setattr(habits.Slide, "seen", lambda _: np.ma.masked_array([1.0, 2.0, 3.0], [True, False, False]))
     with pytest.raises(EnvFault, match=r'is a masked array; return zeros where it masks, and say so in info\["missing'):
         make_env(habit("Slide")).reset()

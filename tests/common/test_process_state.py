@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -58,12 +59,23 @@ def test_a_refusal_is_printed_whatever_its_module_does_with_the_streams(
     assert "actions are Discrete" in complaint(["check-env", "quiet:Quiet-v0"], capsys)
 
 
-def test_what_it_has_not_changed_it_finds_as_it_is_now(monkeypatch: pytest.MonkeyPatch) -> None:
-    make_env(EnvConfig("tests.meddling_env:Meddling-dtype-early-v0")).close()
-    ours = io.StringIO()
-    monkeypatch.setattr("sys.stdout", ours)
-    with ApartCall("tests.meddling_env:Meddling-dtype-early-v0", "reset", 1.0):
-        assert sys.stdout is ours
+def test_what_another_thread_writes_to_is_not_taken_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A program may redirect its output while another of its threads plays."""
+    monkeypatch.setattr("sys.stdout", sys.stdout)
+    begun, redirected, theirs = threading.Event(), threading.Event(), io.StringIO()
+
+    def play() -> None:
+        with ApartCall("Mine-v0", "reset", 60.0):
+            begun.set()
+            redirected.wait()
+
+    with ThreadPoolExecutor(1) as pool:
+        played = pool.submit(play)
+        begun.wait()
+        sys.stdout = theirs
+        redirected.set()
+        played.result()
+    assert sys.stdout is theirs
 
 
 def test_what_one_environment_has_changed_another_does_not_find() -> None:

@@ -63,10 +63,10 @@ def test_what_was_exported_for_one_role_is_not_passed_on(quick: Path, monkeypatc
 
 def test_what_an_environment_sets_for_itself_is_not_passed_on(quick: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Roles that play import its module; a learner is to see its GPU."""
-    monkeypatch.setattr(ApartCall, "variables", {})
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
     monkeypatch.setenv("NOT_FOR_IT", "ours")
-    monkeypatch.delenv("ITS_OWN", raising=False)
+    monkeypatch.setenv("ITS_OWN", "")
+    monkeypatch.delenv("ITS_OWN")
     for gpu in ("1", ""):
         with ApartCall("Mine-v0", "make", 1.0):
             os.environ.update(CUDA_VISIBLE_DEVICES=gpu, ITS_OWN="theirs")
@@ -76,6 +76,9 @@ def test_what_an_environment_sets_for_itself_is_not_passed_on(quick: Path, monke
     told = variables_of_a_role(quick)
     assert (told["CUDA_VISIBLE_DEVICES"], told["NOT_FOR_IT"], told.get("ITS_OWN")) == ("0", "ours", None)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2")  # the caller's, since
+    assert variables_of_a_role(quick)["CUDA_VISIBLE_DEVICES"] == "2"
+    with ApartCall("Mine-v0", "make", 1.0):
+        os.environ["CUDA_VISIBLE_DEVICES"] = ""
     assert variables_of_a_role(quick)["CUDA_VISIBLE_DEVICES"] == "2"
 
 
