@@ -178,7 +178,7 @@ gym.register("Untold-v0", entry_point=Untold)
 gym.register("Spent-v0", entry_point=Spent)
 for _what in ("bounds", "observations"):
     gym.register(f"Drawn-{_what}-v0", entry_point=Drawn, kwargs={"what": _what})
-for _name, _habits in {"Reused": (True, 9, bool), "Once": (False, 1, bool), "Counted": (False, 9, np.int64)}.items():
+for _name, _habits in {"Rewritten": (True, 9, bool), "Once": (False, 1, bool), "Counted": (False, 9, np.int64)}.items():
     gym.register(f"{_name}-v0", Short, kwargs=dict(zip(("reused", "length", "kind"), _habits, strict=True)))
 gym.register("Vaster-v0", entry_point=Vaster)
 gym.register("Panics-v0", entry_point=Panics)
@@ -284,7 +284,7 @@ def test_sizes_that_differ_from_one_to_the_next_are_a_fault(
     assert f"fault: {words}; give each the same\n" in text
 
 
-@pytest.mark.parametrize("env", ["Reused", "Once", "Counted"])
+@pytest.mark.parametrize("env", ["Rewritten", "Once", "Counted"])
 def test_gymnasiums_notes_of_what_is_sound_are_left_out(env: str, capsys: pytest.CaptureFixture[str]) -> None:
     status, text = checked(f"{env}-v0", capsys, "--steps", "50")
     assert status == 0

@@ -54,7 +54,7 @@ WRITES: dict[str, Call] = {
 FAQ = (Path(__file__).parents[2] / "docs" / "faq.md").read_text()
 TABLE = FAQ.split("## What a Redis of my own answers")[1].split("\n## ")[0]
 ROWS = re.findall(r"^\| (`[A-Z].*?) \|", TABLE, re.MULTILINE)
-MEANS = BusUnavailable, BusFull, ConfigError, ConfigError, ConfigError  # of each row of the docs' table
+MEANS = BusUnavailable, BusFull, ConfigError, ConfigError, ConfigError, ConfigError  # of each row of the docs' table
 ANSWERS = {code: means for row, means in zip(ROWS, MEANS, strict=True) for code in re.findall(r"[A-Z]+", row)}
 del ANSWERS["LOADING"]  # for redis-py a lost connection
 OF_ANOTHER_TYPE = {  # a key that somebody made a list, and who stumbles over it
