@@ -1,11 +1,11 @@
-"""Wall time from the command to a policy of 2 000 and one of 4 000 on HalfCheetah, beside SAC in JAX and in torch.
+"""Wall time from the command to a policy of 2 000 and one of 4 000 on HalfCheetah, beside SAC in JAX.
 
-    python -m benchmarks.end_to_end [--env ENV] [--goals 2000 4000] [--seeds 1 2 3] [--every 5000] [--peers PEER ...]
+    python -m benchmarks.end_to_end [--env ENV] [--goals 2000 4000] [--seeds 1 2 3] [--every 5000]
 
 A goal is reached at the second of two consecutive evaluations above it, each of 5 deterministic episodes, every 5 000
-environment steps; the clock starts with the process. Ours is ``rmc train`` as it comes. SAC of stable-baselines3 has
-its defaults, or rl-baselines3-zoo's settings: 10 000 random steps before the first update. SBX's starts likewise, and
-makes 8 or 32 updates after as many steps. Each has all cores for itself, one run after another.
+environment steps; the clock starts with the process. Ours is ``rmc train`` as it comes. SBX's SAC makes 10 000 random
+steps before the first update, as in rl-baselines3-zoo, and then 32 updates every 32 steps. Each has all cores for
+itself, one run after another.
 What results/end-to-end.jsonl has already is not run again: an interrupted benchmark goes on where it was.
 """
 
@@ -30,12 +30,7 @@ CURVES = HERE / "results" / "end-to-end.jsonl"
 EPISODES = 5
 LIMIT_SECONDS = 3600.0
 LARGEST_GOAL = 4000.0  # of curves that do not say theirs, too
-PEERS = {  # script, and its arguments after the shared ones
-    "stable-baselines3 SAC, defaults": ("sb3_end_to_end", 100),
-    "stable-baselines3 SAC, rl-zoo": ("sb3_end_to_end", 10_000),
-    "SBX SAC, 8 updates a call": ("sbx_end_to_end", 8, 2),
-    "SBX SAC, 32 updates a call": ("sbx_end_to_end", 32, 2),
-}
+PEER = "SBX SAC, 32 updates a call"
 Point = tuple[float, float]  # seconds since the command, return
 
 
@@ -57,17 +52,16 @@ def ours(env: str, seed: int, every: int) -> Iterator[Point]:
             _end(process)
 
 
-def sac(python: Path, peer: str, env: str, seed: int, every: int) -> Iterator[Point]:
-    """The same of a peer, which prints a line for each."""
-    name, *arguments = PEERS[peer]
-    began, script = time.time(), str(HERE / "peers" / f"{name}.py")
-    process = _started([str(python), script, env, *map(str, (seed, every, EPISODES, *arguments))])
+def sbx(python: Path, env: str, seed: int, every: int) -> Iterator[Point]:
+    """The same of the peer, which prints a line for each."""
+    began, script = time.time(), str(HERE / "peers" / "sbx_end_to_end.py")
+    process = _started([str(python), script, env, *map(str, (seed, every, EPISODES))])
     assert process.stdout is not None
     try:
         for line in process.stdout:
             if line.startswith("{"):
                 yield time.time() - began, json.loads(line)["return"]
-        sys.exit(f"{peer}: it ended by itself, with status {process.wait()}; make peers installs what it needs")
+        sys.exit(f"{PEER}: it ended by itself, with status {process.wait()}; make peers installs what it needs")
     finally:
         _end(process)
 
@@ -112,18 +106,22 @@ def _saved_curve(key: dict[str, object], goal: float) -> list[Point] | None:
     return None
 
 
-def _rows(env: str, goal: float, times: dict[str, list[float]], seeds: int) -> list[Row]:
-    """Medians over the seeds, a row a peer; a seed that did not get there counts as one that never does."""
+def row(env: str, goal: float, times: dict[str, list[float]], seeds: int) -> Row | None:
+    """Medians over the seeds; a seed that did not get there counts as one that never does. None: most of ours did not.
+
+    Where most of the peer's did not, there is no ratio.
+    """
     middle = {who: statistics.median(all_) for who, all_ in times.items()}
-    range_ = {who: (min(all_), max(all_) if math.isfinite(max(all_)) else None) for who, all_ in times.items()}
-    rows = []
-    for peer in [who for who in times if who != "ours"] or PEERS:
-        peer_seconds = middle.get(peer)
-        ratio = None if peer_seconds is None else peer_seconds / middle["ours"]
-        spread = {"ours": range_["ours"]} | ({"peer": range_[peer]} if peer in range_ else {})
-        name = f"time to {goal:g}, {env}"
-        rows.append(Row(name, "s", middle["ours"], peer, peer_seconds, ratio, None, "", spread, seeds, command()))
-    return rows
+    if not math.isfinite(middle["ours"]):
+        print(f"time to {goal:g}, {env}: ours did not get there", flush=True)
+        return None
+    range_ = {
+        who: (min(*all_, LIMIT_SECONDS), max(all_) if math.isfinite(max(all_)) else None) for who, all_ in times.items()
+    }
+    peer = middle.get(PEER, math.inf)
+    its, ratio = (peer, peer / middle["ours"]) if math.isfinite(peer) else (None, None)
+    spread = {"ours": range_["ours"]} | ({"peer": range_[PEER]} if PEER in times else {})
+    return Row(f"time to {goal:g}, {env}", "s", middle["ours"], PEER, its, ratio, None, "", spread, seeds, command())
 
 
 def main() -> None:
@@ -132,12 +130,11 @@ def main() -> None:
     parser.add_argument("--goals", type=float, nargs="+", default=[2000.0, LARGEST_GOAL])
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
     parser.add_argument("--every", type=int, default=5000, help="environment steps between evaluations")
-    parser.add_argument("--peers", nargs="*", choices=list(PEERS), default=list(PEERS), metavar="PEER")
     options = parser.parse_args()
     python = peer_python("peers")
     runners: dict[str, Callable[[str, int, int], Iterator[Point]]] = {"ours": ours}
     if python:
-        runners |= {peer: partial(sac, python, peer) for peer in options.peers}
+        runners[PEER] = partial(sbx, python)
     curves: dict[str, list[list[Point]]] = {who: [] for who in runners}
     for seed, who in product(options.seeds, runners):
         key = {"who": who, "env": options.env, "seed": seed, "every": options.every}
@@ -151,7 +148,7 @@ def main() -> None:
         curves[who].append(points)
     for goal in options.goals:
         times = {who: [reached(points, goal) or math.inf for points in all_] for who, all_ in curves.items()}
-        save(_rows(options.env, goal, times, len(options.seeds)))
+        save([one for one in [row(options.env, goal, times, len(options.seeds))] if one is not None])
 
 
 if __name__ == "__main__":

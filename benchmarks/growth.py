@@ -30,7 +30,7 @@ ENV = EnvConfig("HalfCheetah-v5")
 SMALL = WindowSpec(obs_dim=4, action_dim=1, state=8, burn_in=2, train=3)  # a million of them fit the memory
 DRAWN = 256  # windows, of the ring
 OFFERED = 1_000.0  # windows a second, by each simulated actor
-Table = list[tuple[int, list[Row]]]  # size, its measurements
+Table = list[tuple[int, Row]]  # size, its measurement
 
 
 def actors(rounds: int, seconds: float) -> Table:
@@ -41,17 +41,17 @@ def actors(rounds: int, seconds: float) -> Table:
         return lambda: measure(spec, 1, count, "", count * OFFERED, seconds).committed
 
     sizes = (1, 2, 4, 8, 16, 32)
-    return [(n, compare(f"growth, {n} actors", "windows/s", committed(n), {}, rounds=rounds)) for n in sizes]
+    return [(n, compare(f"growth, {n} actors", "windows/s", committed(n), {}, rounds=rounds)[0]) for n in sizes]
 
 
 def batch(rounds: int, seconds: float) -> Table:
-    """Updates a second, and the trained steps in them."""
+    """Trained steps a second."""
     run, sizes = robust(ENV), (32, 64, 128, 256, 512)
     return [(size, _learning(f"growth, batch {size}", run, size, rounds, seconds)) for size in sizes]
 
 
 def window(rounds: int, seconds: float) -> Table:
-    """Updates a second at the default batch."""
+    """Trained steps a second at the default batch."""
     run, table = robust(ENV), []
     for steps in (25, 100, 250, 1_000):
         longer = replace(run, window=replace(run.window, trained_steps=steps - run.window.burn_in))
@@ -68,7 +68,7 @@ def ring(rounds: int, seconds: float) -> Table:
             draw = _filled(Path(folder), capacity)
             speed(draw, 0.5)
             name = f"growth, draw and priorities of {DRAWN} of {capacity} windows"
-            table.append((capacity, compare(name, "us", lambda d=draw: 1e6 / speed(d, seconds), {}, rounds=rounds)))  # type: ignore[misc]
+            table.append((capacity, compare(name, "us", lambda d=draw: 1e6 / speed(d, seconds), {}, rounds=rounds)[0]))  # type: ignore[misc]
     return table
 
 
@@ -89,33 +89,26 @@ def _filled(folder: Path, capacity: int) -> Callable[[], int]:
     return draw
 
 
-def _learning(name: str, run: RunConfig, size: int, rounds: int, seconds: float) -> list[Row]:
-    """The whole role on one core: updates a second, and trained steps a second."""
+def _learning(name: str, run: RunConfig, size: int, rounds: int, seconds: float) -> Row:
+    """The whole role on one core: trained steps a second."""
     with replay_of(run) as bus, learner_role(run, bus, size, "auto") as role:
-        speed(lambda: int(role.step()), 1.0)
-        updates = compare(name, "updates/s", lambda: speed(lambda: int(role.step()), seconds), {}, rounds=rounds)
-    return [*updates, *(_in_steps(row, size * run.window.trained_steps) for row in updates)]
+
+        def work() -> int:
+            return size * run.window.trained_steps * int(role.step())
+
+        speed(work, 1.0)
+        return compare(f"{name}, trained", "steps/s", lambda: speed(work, seconds), {}, rounds=rounds)[0]
 
 
-def _in_steps(row: Row, steps: int) -> Row:
-    """The same measurement in trained steps."""
-    spread = {key: (least * steps, (largest or 0.0) * steps) for key, (least, largest) in row.spread.items()}
-    facts = vars(row) | {"name": f"{row.name}, trained", "unit": "steps/s", "ours": row.ours * steps, "spread": spread}
-    return Row(**facts)
-
-
-def slopes(of: str, table: Table) -> list[Row]:
-    """Over all sizes, for each unit, and at which size the slope from one to the next bends most."""
-    fitted = []
-    for series in zip(*(rows for _, rows in table), strict=True):
-        points = [(math.log(size), math.log(row.ours)) for (size, _), row in zip(table, series, strict=True)]
-        steps = [(v - y) / (u - x) for (x, y), (u, v) in pairwise(points)]
-        bends = [abs(after - before) for before, after in pairwise(steps)]
-        whole = (points[-1][1] - points[0][1]) / (points[-1][0] - points[0][0])
-        name, bend = f"growth, slope of {series[0].unit} over {of}", float(table[1 + int(np.argmax(bends))][0])
-        spread, rounds = {"ours": (min(steps), max(steps))}, series[0].rounds
-        fitted.append(Row(name, "", whole, "", None, None, bend, "bends most at", spread, rounds, harness.command()))
-    return fitted
+def slope(of: str, table: Table) -> Row:
+    """Over all sizes, and at which size the slope from one to the next bends most."""
+    points = [(math.log(size), math.log(row.ours)) for size, row in table]
+    steps = [(v - y) / (u - x) for (x, y), (u, v) in pairwise(points)]
+    bends = [abs(after - before) for before, after in pairwise(steps)]
+    whole = (points[-1][1] - points[0][1]) / (points[-1][0] - points[0][0])
+    name, bend = f"growth, slope of {table[0][1].unit} over {of}", float(table[1 + int(np.argmax(bends))][0])
+    spread: dict[str, tuple[float, float | None]] = {"ours": (min(steps), max(steps))}
+    return Row(name, "", whole, "", None, None, bend, "bends most at", spread, table[0][1].rounds, harness.command())
 
 
 def main() -> None:
@@ -128,7 +121,7 @@ def main() -> None:
     torch.set_num_threads(1)
     for name in options.what:
         table = tables[name](options.rounds, options.seconds)
-        harness.save([*(row for _, rows in table for row in rows), *slopes(name, table)])
+        harness.save([*(row for _, row in table), slope(name, table)])
 
 
 if __name__ == "__main__":

@@ -19,8 +19,9 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from benchmarks import PEER_ENVIRONMENT
+from benchmarks import PEER_ENVIRONMENT, report
 from rmc.common.bus.redis_bus import RedisBus
+from rmc.common.shard import WHOLE, Shard
 from rmc.common.window import Rows, WindowSpec
 from rmc.deploy.redis.server import RedisServer
 from rmc.replay_server.config import ReplayConfig
@@ -51,17 +52,6 @@ class Row:
     spread: dict[str, tuple[float, float | None]]  # least and largest of ours, peer and limit; None: never
     rounds: int
     command: str
-
-    def show(self) -> str:
-        """One line for people."""
-        least, largest = self.spread["ours"]
-        most = "never" if largest is None else f"{largest:,.1f}"
-        text = f"{self.name:44s} {self.ours:12,.1f} {self.unit} ({least:,.1f} to {most})"
-        if self.peer:
-            text += f"; {self.peer}: " + ("not installed, see make peers" if self.peer_value is None else "")
-        if self.peer_value is not None:
-            text += f"{self.peer_value:,.1f}, ours {self.ratio:.2f} times better"
-        return text + (f"; {self.limit_is}: {self.limit:,.1f}" if self.limit is not None else "")
 
 
 def compare(
@@ -111,7 +101,7 @@ def save(rows: list[Row]) -> None:
     kept = [row for row in before if (row["name"], row["peer"]) not in new]
     path.write_text(json.dumps([*kept, *(asdict(row) for row in rows)], indent=1) + "\n")
     for row in rows:
-        print(row.show(), flush=True)
+        print(report.line([asdict(row) | {"day": "now"}]), flush=True)
 
 
 def argument_parser(doc: str | None) -> argparse.ArgumentParser:
@@ -214,10 +204,10 @@ def random_rows(spec: WindowSpec, count: int) -> Rows:
     return rows
 
 
-def _serve(url: str, folder: str, spec: WindowSpec, config: ReplayConfig, core: int) -> None:
-    os.sched_setaffinity(0, {core})
+def serve(url: str, folder: str, spec: WindowSpec, config: ReplayConfig, actors: int = 1, shard: Shard = WHOLE) -> None:
+    """A replay server as a run has it, until the run is asked to stop."""
     bus = RedisBus(url, RUN)
-    server = ReplayServer(spec, config, Path(folder), 0, ENDLESS, 1, ENDLESS, bus)
+    server = ReplayServer(spec, config, Path(folder), 0, ENDLESS, actors, ENDLESS, bus, shard)
     process = ReplayProcess(server, SocketServer(server, f"unix:{folder}/replay.sock", SECRET, 1024))
     while bus.stop_requested() is None:
         end = time.monotonic() + 0.5
@@ -236,9 +226,10 @@ def replay_process(spec: WindowSpec, config: ReplayConfig) -> Iterator[RedisBus]
         with on_cores({cores[0]}):
             bus = RedisBus(redis.url(), RUN)
             server = multiprocessing.get_context("spawn").Process(
-                target=_serve, args=(redis.url(), folder, spec, config, cores[-1])
+                target=serve, args=(redis.url(), folder, spec, config)
             )
             server.start()
+            os.sched_setaffinity(server.pid or 0, {cores[-1]})
             while bus.replay_address("replay") is None:
                 time.sleep(0.05)
             try:

@@ -4,10 +4,10 @@ python -m benchmarks.report
 """
 
 import json
+from pathlib import Path
 from typing import Any
 
-from benchmarks.harness import HERE
-
+HERE = Path(__file__).parent
 PAGE = HERE.parent / "docs" / "performance.md"
 BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
 HEAD = (
@@ -44,7 +44,7 @@ def _range(row: dict[str, Any], of: str, value: float) -> str:
 
 def _beside(row: dict[str, Any]) -> str:
     if row["peer_value"] is None:
-        return f"{row['peer']}: not installed"
+        return f"{row['peer']}: " + ("not reached" if "peer" in row["spread"] else "not installed")
     ratio = "" if row["ratio"] is None else f", **{row['ratio']:.2f}**"
     return f"{row['peer']} {_range(row, 'peer', row['peer_value'])}{ratio}"
 

@@ -21,7 +21,7 @@ from pathlib import Path
 
 import psutil
 
-from benchmarks.harness import ENDLESS, RUN, random_rows
+from benchmarks.harness import ENDLESS, RUN, random_rows, serve
 from benchmarks.sender import CHUNK, Sender
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.env.config import EnvConfig
@@ -31,7 +31,6 @@ from rmc.common.wire import encode_windows
 from rmc.deploy.redis.server import RedisServer
 from rmc.deploy.run.presets import robust
 from rmc.replay_server.config import ReplayConfig
-from rmc.replay_server.server import ReplayServer
 
 BEHIND = 256  # entries that a simulated actor sends ahead of what is acknowledged: of 32 actors they fit into Redis
 KEPT_UP = 0.95  # of what is offered
@@ -53,19 +52,6 @@ class Point:
     stolen: float  # cores that the host kept to itself
 
 
-def _serve(url: str, folder: str, spec: WindowSpec, actors: int, shard: Shard) -> None:
-    bus = RedisBus(url, RUN)
-    config = ReplayConfig(capacity=4096 * shard.count, warmup_steps=ENDLESS)
-    server = ReplayServer(spec, config, Path(folder), 0, ENDLESS, actors, ENDLESS, bus, shard)
-    bus.announce_replay(server.owner, "nowhere")
-    while bus.stop_requested() is None:
-        end = time.monotonic() + 0.5
-        while time.monotonic() < end:
-            if not server.step():
-                time.sleep(0.002)
-    server.close()
-
-
 def _simulate(url: str, actor: int, spec: WindowSpec, rate: float) -> None:
     """Send ``rate`` windows a second, as far as the acknowledged ones let it."""
     sender, payload = Sender(RedisBus(url, RUN), spec, actor), encode_windows(random_rows(spec, CHUNK), spec)
@@ -82,9 +68,9 @@ def _system(spec: WindowSpec, shards: int, actors: int, rate: float) -> Iterator
     """Redis, replay servers and simulated actors as processes; their numbers by kind."""
     spawn = multiprocessing.get_context("spawn")
     with tempfile.TemporaryDirectory() as folder, RedisServer(Path(folder)) as redis:
-        bus = RedisBus(redis.url(), RUN)
+        bus, config = RedisBus(redis.url(), RUN), ReplayConfig(capacity=4096 * shards, warmup_steps=ENDLESS)
         servers = [
-            spawn.Process(target=_serve, args=(redis.url(), f"{folder}/{k}", spec, actors, Shard(k, shards)))
+            spawn.Process(target=serve, args=(redis.url(), f"{folder}/{k}", spec, config, actors, Shard(k, shards)))
             for k in range(shards)
         ]
         senders = [

@@ -229,11 +229,6 @@ class Agent(nn.Module):
         self.next_frame = ObservationImputer(obs_dim, action_dim, config) if config.impute_missing else None
         self.privileged_normalizer = Normalizer(privileged, config.normalize_observations) if privileged else None
 
-    def start_gates(self, steps: int) -> None:
-        """The memory's, as configured for windows of so many steps, before anything is learnt."""
-        if self.config.gate_init == "chrono":
-            self.memory.start_gates(steps)
-
     def features(self, remembered: MemoryOutput) -> Tensor:
         """What the heads read: h_t, what is beside it, or both."""
         match self.config.head_input:
@@ -320,7 +315,8 @@ def initial_agent(spec: WindowSpec, config: AgentConfig, seed: int) -> Agent:
     torch.default_generator.manual_seed(seed)  # a GPU's stay as they are
     try:
         agent = Agent(spec.obs_dim, spec.action_dim, config, spec.missing, spec.privileged)
-        agent.start_gates(spec.steps)
+        if config.gate_init == "chrono":
+            agent.memory.start_gates(spec.steps)
     finally:
         torch.set_rng_state(drawn)
     return agent

@@ -162,9 +162,7 @@ class DeviceUpdate:
         model_losses, model = update.model_pass(batch)
         self._beside.wait_stream(current)
         with torch.cuda.stream(self._beside):
-            actor_critic_losses, actor_critic = update.actor_critic_pass(batch, model, self._beta)
-            actor_critic_norm = update.step(update.optimizers[1:], actor_critic_losses.values())
-            update.after_actor_critic_step(actor_critic)
+            actor_critic, actor_critic_norm = update.train_actor_critic(batch, model, self._beta)
         model_norm = update.step(update.optimizers[:1], model_losses.values())
         update.after_model_step(model)
         current.wait_stream(self._beside)

@@ -139,8 +139,10 @@ class _Heads(torch.autograd.Function):
         layers = [kept[begin : begin + size] for begin in range(0, len(kept), size)]
         for net, (first, second) in enumerate(zip(layers[::2], layers[1::2], strict=True)):
             own = gradients.of_net(net)
-            d2 = _to_second_layer(grad[net], second, share, w3[net], own)
-            d1 = _to_first_layer(d2, first, share, w2[net], own)
+            d2 = _last_layer_back(grad[net], second[:2][-1], w3[net], own.weights[2], own.biases[2])
+            _to_relu(d2, second, share, own.affine[2:], own.biases[1])
+            d1 = torch.mm(d2, w2[net].t())
+            _to_relu(d1, first, share, own.affine[:2], own.biases[0])
             if dx.shape[1]:
                 dx.addmm_(d1, w1[net][columns].t())
             if wants_weights:
@@ -176,28 +178,15 @@ class _Gradients(NamedTuple):
         return [part for pair in zip(self.weights, self.biases, strict=True) for part in pair] + self.affine
 
 
-def _to_second_layer(grad: Tensor, kept: list[Tensor], share: Tensor, w: Tensor, own: _Gradients) -> Tensor:
-    """From that of one net's output, (N, out), to before its second ReLU, (N, K).
+def _to_relu(d: Tensor, kept: list[Tensor], share: Tensor, affine: list[Tensor], db: Tensor) -> None:
+    """d (N, K), the gradient of what a layer hands on, <- that before its ReLU; fills those of gain, offset and bias.
 
-    ``kept`` is a ReLU's output and, with batch norm, the fields of the ``_Normed`` that was made of it.
+    ``kept`` is the ReLU's output and, with batch norm, the fields of the ``_Normed`` that was made of it.
     """
     relu, *normed = kept
-    if not normed:
-        return _last_layer_back(grad, relu, w, own.weights[2], own.biases[2], own.biases[1])
-    d = _normed_last_layer_back(grad, normed[0], w, own.weights[2], own.biases[2])
-    _normalize_back(d, normed[1:], share, own.affine[2:])
-    kernels.relu_back(bits(d), bits(relu), own.biases[1].numpy())
-    return d
-
-
-def _to_first_layer(d2: Tensor, kept: list[Tensor], share: Tensor, w: Tensor, own: _Gradients) -> Tensor:
-    """From that before one net's second ReLU to before its first, (N, K) each."""
-    relu, *normed = kept
-    d1 = torch.mm(d2, w.t())
     if normed:
-        _normalize_back(d1, normed[1:], share, own.affine[:2])
-    kernels.relu_back(bits(d1), bits(relu), own.biases[0].numpy())
-    return d1
+        _normalize_back(d, normed[1:], share, affine)
+    kernels.relu_back(bits(d), bits(relu), db.numpy())
 
 
 def _normalize_back(grad: Tensor, normed: list[Tensor], share: Tensor, affine: list[Tensor] | None = None) -> None:
@@ -205,13 +194,6 @@ def _normalize_back(grad: Tensor, normed: list[Tensor], share: Tensor, affine: l
     x, scale = normed
     of_gain, of_offset = affine or [torch.empty_like(scale) for _ in range(2)]
     kernels.normalize_back(bits(grad), bits(x), scale.numpy(), share.numpy(), of_gain.numpy(), of_offset.numpy())
-
-
-def _normed_last_layer_back(grad: Tensor, x: Tensor, w: Tensor, dw: Tensor, db: Tensor) -> Tensor:
-    """The gradient of x, (N, in) in bfloat16; fills those of w (in, 1) and b (1,)."""
-    torch.sum(grad, 0, out=db)
-    torch.mm(x.float().t(), grad, out=dw)
-    return torch.mm(grad, w.t()).to(BF16)
 
 
 def relu_layer(x: Tensor, w: Tensor, b: Tensor) -> Tensor:
@@ -229,19 +211,12 @@ def _last_layer(x: Tensor, w: Tensor, b: Tensor, out: Tensor) -> None:
         torch.add(torch.mm(x.to(w.dtype), w), b, out=out)
 
 
-def _last_layer_back(grad: Tensor, x: Tensor, w: Tensor, dw: Tensor, db: Tensor, db_before: Tensor) -> Tensor:
-    """The gradient before the ReLU that gave x, (N, in) in bfloat16; fills those of w, b and of the bias before."""
+def _last_layer_back(grad: Tensor, x: Tensor, w: Tensor, dw: Tensor, db: Tensor) -> Tensor:
+    """The gradient of x, (N, in) in bfloat16; fills those of w and b. Products in w's type."""
     torch.sum(grad, 0, out=db)
-    if w.shape[1] == 1 and w.dtype == torch.float32:
-        back = torch.empty_like(x)
-        of_w, of_x = w.detach().numpy()[:, 0], bits(x)
-        kernels.dot_back(grad.numpy()[:, 0], of_x, of_w, bits(back), dw.numpy()[:, 0], db_before.numpy())
-        return back
     d = grad.to(w.dtype)
     _product(x.to(w.dtype), d, dw)
-    back = torch.mm(d, w.t()).to(BF16)
-    kernels.relu_back(bits(back), bits(x), db_before.numpy())
-    return back
+    return torch.mm(d, w.t()).to(BF16)
 
 
 def _product(x: Tensor, d: Tensor, out: Tensor) -> None:

@@ -159,19 +159,6 @@ def dot(x: Bits, w: Floats, bias: Floats, out: Floats) -> None:
 
 
 @_compiled
-def dot_back(grad: Floats, x: Bits, w: Floats, out: Bits, dw: Floats, db: Floats) -> None:
-    """The way back through ``dot`` and the ReLU that gave x; (N,), (N, K), (K,), and into (N, K), (K,), (K,)."""
-    dw[:] = np.float32(0.0)
-    for i in range(x.shape[0]):
-        for j in range(x.shape[1]):
-            out[i, j] = _down(grad[i] * w[j]) if x[i, j] != 0 else np.uint16(0)
-        for j in range(x.shape[1]):
-            db[j] += _up(out[i, j])
-        for j in range(x.shape[1]):
-            dw[j] += grad[i] * _up(x[i, j])
-
-
-@_compiled
 def adam(
     w: Floats, grad: Floats, mean: Floats, square: Floats, low: Bits, step: Floats,
     rate: float, beta1: float, beta2: float, eps: float,
@@ -192,19 +179,6 @@ def adam(
             first, second = m[j] + by_mean * (g[j] - m[j]), decay * v[j] + by_square * g[j] * g[j]
             m[j], v[j] = first, second
             x[j] -= size * first / (np.sqrt(second) * root + floor)
-        if low.size:
-            lower(x, low[begin:end])
-
-
-@_compiled
-def polyak(target: Floats, w: Floats, low: Bits, weight: float) -> None:
-    """target <- target + weight (w - target), and ``low`` <- it in bfloat16, as in ``adam``; (K,)."""
-    share = np.float32(weight)
-    for begin in range(0, w.size, BLOCK):
-        end = min(begin + BLOCK, w.size)
-        x, y = target[begin:end], w[begin:end]
-        for j in range(x.size):
-            x[j] += share * (y[j] - x[j])
         if low.size:
             lower(x, low[begin:end])
 

@@ -111,6 +111,8 @@ class Learner:
             self.checkpoints.unlock()
             raise
 
+    # Updating: a drawn sample's rows as bytes, to ``learner/update.py`` by way of the device or of two processes
+
     def step(self) -> bool:
         """Draw and update once, with all that is due after it. Raises FencedError where a newer learner has come."""
         if self.finished:
@@ -198,6 +200,8 @@ class Learner:
             serials, priorities = self._returning.popleft()
             self.replay.update_priorities(serials, priorities.wait().numpy())
 
+    # Publishing: weights to those that act
+
     def publish(self) -> None:
         """Broadcast the policy with the newest observation statistics frozen into it. Raises FencedError."""
         self._freeze_statistics()
@@ -232,6 +236,8 @@ class Learner:
             statistics = own + self._observed_before
             sums = (statistics.count, statistics.total, statistics.total_square)
             self.agent.freeze_statistics(*(torch.from_numpy(numbers).to(self.device) for numbers in sums))
+
+    # Saving and resuming
 
     def checkpoint(self) -> bool:
         """Save, and broadcast that: for an evaluation, and as what acts, since a resumed run begins with it, too.
@@ -299,6 +305,8 @@ class Learner:
         self._next_checkpoint = self._after(self.env_steps)
         log.info("resumed at update %d, agent step %d", self.updates, self.env_steps)
         return progress.epoch
+
+    # What the process asks
 
     def waiting_for(self) -> str:
         return self._waiting

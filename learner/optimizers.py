@@ -1,4 +1,4 @@
-"""Adam for parts of an agent, its saved states, and Polyak's average; on a CPU in one pass over memory each."""
+"""Adam for parts of an agent, on a CPU in one pass over memory; its saved states; Polyak's average."""
 
 import inspect
 from collections.abc import Iterable, Mapping
@@ -53,13 +53,7 @@ class CompiledAdam(torch.optim.Adam):
 @torch.no_grad()
 def polyak_update(target: nn.Module, source: nn.Module, weight: float) -> None:
     """target <- target + weight (source - target), parameter by parameter; ``weight`` from 0 to 1."""
-    pairs = list(zip(target.parameters(), source.parameters(), strict=True))
-    if pairs[0][0].device.type != "cpu":
-        torch._foreach_lerp_([old for old, _ in pairs], [new for _, new in pairs], weight)
-        return
-    rounded = rounded_weights([target])
-    for old, new in pairs:
-        kernels.polyak(_flat(old), _flat(new), _bf16_copy(rounded, old), weight)
+    torch._foreach_lerp_(list(target.parameters()), list(source.parameters()), weight)
 
 
 def _flat(tensor: Tensor) -> NDArray[np.float32]:

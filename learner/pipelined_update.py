@@ -144,9 +144,7 @@ class PipelinedUpdate:
         (slot, number, plan), update = self._pending.popleft(), self._update
         batch = view_batch(slot.raw, slot.importance, self._spec, plan)
         model = slot.model_of(batch)
-        loss_values, actor_critic = update.actor_critic_pass(batch, model, slot.beta)
-        norm = update.step(update.optimizers[1:], loss_values.values())
-        update.after_actor_critic_step(actor_critic)
+        actor_critic, norm = update.train_actor_critic(batch, model, slot.beta)
         update.average.update(number, ACTOR_CRITIC_PARTS)
         return update.result(batch, model, actor_critic, torch.hypot(norm, slot.norm))
 
@@ -218,9 +216,7 @@ class PipelinedUpdate:
 
     def _model_half(self, slot: Slot, number: int, plan: Plan) -> None:
         update, batch = self._update, view_batch(slot.raw, slot.importance, self._spec, plan)
-        loss_values, model = update.model_pass(batch)
-        norm = update.step(update.optimizers[:1], loss_values.values())
-        update.after_model_step(model)
+        model, norm = update.train_model(batch)
         update.average.update(number, MODEL_PARTS)
         slot.write(batch, model, norm)
 

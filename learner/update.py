@@ -2,6 +2,7 @@
 
 Shapes: B batch, L_b burn-in, L_t trained steps, O observation, A action, H hidden, S state, Z head input, M flags of
 what is missing, P privileged.
+z_t is what heads read: h_t, the paper's s_t, with o_t beside it where configured.
 Nothing here waits for the host: no ``.item()``, no branch on a tensor, static shapes.
 """
 
@@ -97,12 +98,26 @@ class JointUpdate:
         return [make_adam(self.agent, self.config, *parts) for parts in (MODEL_PARTS, ACTOR_CRITIC_PARTS)]
 
     def __call__(self, batch: Batch, beta: Tensor) -> UpdateResult:
-        """One update from a Batch; ``beta`` is a scalar tensor."""
+        """One update from a Batch, in one step of all losses; ``beta`` is a scalar tensor."""
         loss_values, model, actor_critic = self.forward(batch, beta)
         norm = self.step(self.optimizers, loss_values.values())
         self.after_model_step(model)
         self.after_actor_critic_step(actor_critic)
         return self.result(batch, model, actor_critic, norm)
+
+    def train_model(self, batch: Batch) -> tuple[ModelPass, Tensor]:
+        """The half of memory and world model, where no other loss moves them, and its gradient's norm."""
+        loss_values, model = self.model_pass(batch)
+        norm = self.step(self.optimizers[:1], loss_values.values())
+        self.after_model_step(model)
+        return model, norm
+
+    def train_actor_critic(self, batch: Batch, model: ModelPass, beta: Tensor) -> tuple[ActorCriticPass, Tensor]:
+        """The other half, which moves critics, policy and temperature alone, and its gradient's norm."""
+        loss_values, actor_critic = self.actor_critic_pass(batch, model, beta)
+        norm = self.step(self.optimizers[1:], loss_values.values())
+        self.after_actor_critic_step(actor_critic)
+        return actor_critic, norm
 
     def forward(self, batch: Batch, beta: Tensor) -> tuple[Losses, ModelPass, ActorCriticPass]:
         """Every loss from the parameters as they stand, in the order of the paper's section 3."""
@@ -120,23 +135,24 @@ class JointUpdate:
             # Memory: h_t from the stored state, burned in without gradient
             o, remembered = impute_and_unroll(agent, o, batch)
             z = self._to_bf16(agent.features(remembered))
-
-            # Prediction, and curiosity from its error
-            target = remembered
+            memories = {"online": remembered}
             if self.ema_memory is not None:
                 with torch.no_grad():
-                    target = unroll(self.ema_memory, o, batch)
-            latent = (target if c.latent_target == "ema" else remembered).hidden.detach().float()
-            prediction = agent.world_model((z if "model" in TRAINS_MEMORY[c.scheme] else z.detach())[:, :-1], a)
-            change = latent[:, 1:] - latent[:, :-1]
+                    memories["ema"] = unroll(self.ema_memory, o, batch)
+            next_z = self._to_bf16(agent.features(memories[c.target_memory]))[:, 1:].detach()
+
+            # Prediction of h_{t+1} - h_t, and curiosity from its error
+            h = memories[c.latent_target].hidden.detach().float()
+            change = h[:, 1:] - h[:, :-1]
+            prediction = agent.world_model(self._for("model", z)[:, :-1], a)
             error = losses.model_error(prediction.hidden_change.float(), change, c.model_norm)
             i, curiosity_variance = self._scaled(losses.curiosity(error, d, m), m)
-            next_z = (self._to_bf16(agent.features(target)) if c.target_memory == "ema" else z)[:, 1:].detach()
-        loss_values = {"model_loss": losses.model_loss(error, d, m)}
         o = o[:, batch.trained]
         imputer_losses = self._imputer_losses(o, remembered, batch, m)
         grounding_loss, unexplained = self._grounding_loss(o, prediction, batch, m)
-        loss_values |= imputer_losses | grounding_loss
+        loss_values = {"model_loss": losses.model_loss(error, d, m)} | imputer_losses | grounding_loss
+
+        # What is reported: nothing is learnt from it
         metrics = model_metrics(detached(loss_values), change, i, d, m, c.model_norm)
         fill_loss = detached(imputer_losses).get("fill_loss", self.fill_loss)
         if agent.next_frame is not None:
@@ -150,16 +166,21 @@ class JointUpdate:
         a, r, d, m = _trained(batch)
         privileged = agent.normalized_privileged(batch.privileged[:, batch.trained])
         alpha = agent.log_alpha.exp().detach()
-        z_value, z_policy = (z if loss in TRAINS_MEMORY[c.scheme] else z.detach() for loss in ("value", "policy"))
+        z_value, z_policy = self._for("value", z), self._for("policy", z)
         with self._autocast():
+            # A sample of the policy at every h_t
             with torch.set_grad_enabled(batch.plan.trains_policy):
                 mean, log_std = agent.policy(z_policy)
                 pi, log_pi = squashed_sample(mean, log_std, self._noise_like(mean, batch.cut))
+
+            # Q of (h_t, a_t), and its target from (h_{t+1}, a')
             taken = critic_input(z_value[:, :-1], privileged[:, :-1]), a
             following = critic_input(model.next_z, privileged[:, 1:]), pi[:, 1:].detach()
             q, next_q = self._values(taken, following, m)
             next_value = losses.soft_value(next_q, alpha, log_pi[:, 1:].detach())
             y = losses.td_target(r + beta * model.curiosity, c.gamma, d, next_value, m, c.n_step)
+
+            # Q that the policy maximises
             z_actor = z_policy if c.policy_through_q else z.detach()
             proposed = critic_input(z_actor[:, :-1], privileged[:, :-1]), pi[:, :-1]
 
@@ -170,6 +191,8 @@ class JointUpdate:
         }
         if batch.plan.trains_policy:
             loss_values["policy_loss"] = losses.policy_loss(log_pi, self._frozen_q(*proposed), alpha, m)
+
+        # What is reported: nothing is learnt from it
         reported = {"policy_loss": self.policy_loss.clone()} | detached(loss_values)
         metrics = actor_critic_metrics(
             reported, alpha, log_pi.detach(), q.detach(), td_error, model.curiosity, r, m, beta
@@ -238,6 +261,10 @@ class JointUpdate:
         loss = losses.grounding_loss(predicted, after, prediction.reward.float(), r, grounded, m)
         unexplained = unexplained_change(predicted.detach() - now, after - now, m.unsqueeze(-1) * both)
         return {"grounding_loss": loss}, unexplained
+
+    def _for(self, loss: str, z: Tensor) -> Tensor:
+        """z as that loss reads it: its gradient reaches the memory where the scheme lets it (the paper's table 1)."""
+        return z if loss in TRAINS_MEMORY[self.config.scheme] else z.detach()
 
     def _autocast(self) -> AbstractContextManager[None]:
         return torch.autocast(self.agent.log_alpha.device.type, torch.bfloat16, enabled=self.bf16)

@@ -113,13 +113,10 @@ def warn_of_torn_rows(store: ReplayStore) -> None:
 
 def _map_priorities(path: Path, ring: Ring) -> NDArray[np.float32]:
     size = 4 * ring.capacity
-    if path.exists() and path.stat().st_size == size:
-        priorities: NDArray[np.float32] = np.memmap(path, np.float32, "r+", shape=(ring.capacity,))
-    else:
+    if not (path.exists() and path.stat().st_size == size):
         reserve(path, size, ring.capacity)
-        priorities = np.memmap(path, np.float32, "r+", shape=(ring.capacity,))
-        priorities[:] = ring.progress.max_priority
-    # Zeros where a power cut kept them from the disk, and what is larger than any that was seen.
+    priorities: NDArray[np.float32] = np.memmap(path, np.float32, "r+", shape=(ring.capacity,))
+    # Zeros of a new file, or where a power cut kept them from the disk, and what is larger than any that was seen.
     unusable = ~((priorities > 0) & (priorities <= np.float32(ring.progress.max_priority)))
     priorities[unusable] = ring.progress.max_priority
     return priorities

@@ -84,7 +84,7 @@ class ReplayServer:
             self._store.close()
             raise
 
-    # -- in ---------------------------------------------------------------------------------------------
+    # Taking in: streams to the ring
 
     def step(self) -> bool:
         """Take in one round of entries: ring, commit, acks. False where there was none."""
@@ -126,7 +126,7 @@ class ReplayServer:
             self._means.add("policy_lag_mean", float(lag.mean()))
             self._largest_lag = max(self._largest_lag, float(lag.max()))
 
-    # -- out --------------------------------------------------------------------------------------------
+    # Giving out: draws, and priorities back
 
     def register_learner(self, epoch: int) -> None:
         """The learner of the same thread has nobody beside it; of others the socket's server knows."""
@@ -213,7 +213,7 @@ class ReplayServer:
         rows: Rows = np.empty(len(slots), self.spec.dtype)
         return rows if self._gather(slots, rows) else None
 
-    # -- about ------------------------------------------------------------------------------------------
+    # What the process asks
 
     def stats(self) -> dict[str, Any]:
         """Counters, flat; who waits at the limiter, for what, since when."""

@@ -78,10 +78,10 @@ class StreamReader:
         if faults.any():
             bodies = self._without_faults(entries, bodies, faults)
             rows = self._stamped(entries, bodies)
-        for entry, body, steps in zip(entries, bodies, self._steps(bodies, rows["new_steps"]), strict=True):
+        for entry, body in zip(entries, bodies, strict=True):
             before = positions.get(entry.actor, StreamPosition(BEFORE_ALL, 0))
             settled = before.settled_steps if entry.id.epoch == before.id.epoch else 0  # an actor's new incarnation
-            settled += self._lost_steps(entry) if body is None else steps
+            settled += self._lost_steps(entry) if body is None else int(body["new_steps"].sum())
             positions[entry.actor] = StreamPosition(entry.id, settled)
         return IngestBatch(rows, positions, broken)
 
@@ -165,14 +165,6 @@ class StreamReader:
         rows["seq"] = np.repeat([entry.id.seq for entry, _ in parts], counts)
         rows["k"] = np.arange(len(rows)) - np.repeat(starts, counts)
         return rows
-
-    @staticmethod
-    def _steps(bodies: list[Rows | None], new_steps: NDArray[np.int32]) -> list[int]:
-        """New agent steps of every entry."""
-        ends = np.cumsum([0 if body is None else len(body) for body in bodies], dtype=np.int64)
-        running = np.concatenate([[0], np.cumsum(new_steps)])[ends]
-        steps: list[int] = np.diff(running, prepend=0).tolist()
-        return steps
 
     def _lost_steps(self, entry: Entry) -> int:
         """At most how many steps a refused entry carried: its actor counts them, so they must not eat its credit."""

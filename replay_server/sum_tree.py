@@ -66,13 +66,7 @@ class SumTree:
 
     def rebuild(self, values: Values) -> None:
         """Replace everything by (capacity,) values."""
-        self._nodes[:] = 0.0
-        self._nodes[self.size : self.size + len(values)] = values
-        start = self.size
-        while start > 1:
-            half = start // 2
-            self._nodes[half:start] = self._nodes[start : 2 * start : 2] + self._nodes[start + 1 : 2 * start : 2]
-            start = half
+        self.set(np.arange(len(values)), values)
 
     def find(self, positions: Values) -> Slots:
         """The slot at which the running sum of values passes each of (B,) positions in [0, total)."""

@@ -1,26 +1,37 @@
-"""SBX's SAC (stable-baselines3 in JAX), a line for each evaluation; so many updates every so many steps, in one call.
+"""SBX's SAC (stable-baselines3 in JAX), a line for each evaluation; 32 updates every 32 steps, in one call.
 
-python sbx_end_to_end.py ENV SEED EVERY EPISODES STEPS THREADS
+python sbx_end_to_end.py ENV SEED EVERY EPISODES
 """
 
-import os
+import json
 import sys
 
-ENV_ID, (SEED, EVERY, EPISODES, STEPS, THREADS) = sys.argv[1], (int(word) for word in sys.argv[2:])
-if THREADS == 1:  # before JAX is imported
-    os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
-
-import gymnasium as gym  # noqa: E402
-from evaluation import Evaluation  # noqa: E402
-from sbx import SAC  # noqa: E402
+import gymnasium as gym
+from sbx import SAC
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.evaluation import evaluate_policy
 
 ENDLESS = 10_000_000
-LEARNING_STARTS = 10_000  # rl-zoo's for MuJoCo
+PACE = {"train_freq": 32, "gradient_steps": 32, "learning_starts": 10_000}  # the last is rl-zoo's for MuJoCo
+
+
+class Evaluation(BaseCallback):
+    """Plays so many deterministic episodes every so many steps."""
+
+    def __init__(self, env_id: str, every: int, episodes: int) -> None:
+        super().__init__()
+        self._env, self._every, self._episodes = gym.make(env_id), every, episodes
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps % self._every == 0:
+            mean, _ = evaluate_policy(self.model, self._env, self._episodes, deterministic=True, warn=False)
+            print(json.dumps({"steps": self.num_timesteps, "return": float(mean)}), flush=True)
+        return True
 
 
 def main() -> None:
-    pace = {"train_freq": STEPS, "gradient_steps": STEPS, "learning_starts": LEARNING_STARTS}
-    SAC("MlpPolicy", gym.make(ENV_ID), seed=SEED, **pace).learn(ENDLESS, Evaluation(ENV_ID, EVERY, EPISODES))
+    env_id, (seed, every, episodes) = sys.argv[1], (int(word) for word in sys.argv[2:])
+    SAC("MlpPolicy", gym.make(env_id), seed=seed, **PACE).learn(ENDLESS, Evaluation(env_id, every, episodes))
 
 
 if __name__ == "__main__":
