@@ -49,7 +49,7 @@ Changes = dict[str, list[Any]]  # by the option's path, what it was and is
 def train(config: BaselineConfig, run_dir: Path | None, console: Console, stop: StopSignal) -> int:
     """Train to the end, or to a stop signal; the exit status. Raises ConfigError before anything is written."""
     validate(config)
-    sizes = _sizes(config)
+    sizes = layout_sizes(env_layout(config.env))
     folder, changed = _open_folder(config, run_dir, sizes)
     status = 1
     try:
@@ -85,11 +85,6 @@ def _conduct(
     returns = return_text(result["eval_return_mean"], result["eval_return_std"])
     console.print(f"after training: return {returns}; {folder.result_file}")
     return 0
-
-
-def _sizes(config: BaselineConfig) -> dict[str, Any]:
-    """What its networks are made for. Raises ConfigError."""
-    return layout_sizes(env_layout(config.env))
 
 
 def _open_folder(config: BaselineConfig, run_dir: Path | None, sizes: dict[str, Any]) -> tuple[RunFolder, Changes]:

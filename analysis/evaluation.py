@@ -13,12 +13,13 @@ from rmc.actors.policy_runner import one_thread
 from rmc.analysis.policy_file import PolicyFile, policy_runner
 from rmc.common.agent import initial_agent
 from rmc.common.env.config import EnvConfig
+from rmc.common.env.describe import layout_of
 from rmc.common.env.make import first_env
 from rmc.common.env.wrappers import Env
 from rmc.common.errors import ConfigError, EnvFault
 from rmc.common.policy_header import PolicyHeader
 from rmc.deploy.run.config import RunConfig
-from rmc.deploy.run.env_sizes import check_sizes, env_sizes, layout_sizes
+from rmc.deploy.run.env_sizes import check_sizes, layout_sizes
 
 FINAL_EPISODES = 10  # of a run's first and last evaluation
 SAY_SECONDS = 10.0  # between lines that an evaluation goes on
@@ -47,30 +48,6 @@ class EvaluationProgress:
             self._console.print(f"{self._what}: {at}", soft_wrap=True)
 
 
-def evaluate_blob(
-    header: PolicyHeader,
-    blob: bytes,
-    episodes: int,
-    flicker: float | None = None,
-    seconds: float = 0.0,
-    watch: Watch = lambda _: None,
-) -> dict[str, Any]:
-    """Deterministic episodes of a policy, cut after ``seconds`` (0: never): mean, deviation and number of returns.
-
-    Raises ConfigError where its environment cannot be made, or has other sizes than the policy; EnvFault where it
-    breaks in every episode.
-    """
-    env = header.env if flicker is None else dataclasses.replace(header.env, flicker=flicker)
-    runner = policy_runner(header, blob)
-    with one_thread():
-        seed = first_start(header.seed, final=True)
-        try:
-            rollout = play_episodes(runner, lambda: policy_env(header, env), episodes, seed, seconds, watch)
-        except EnvFault as fault:
-            raise EnvFault(f"{fault}; rmc check-env {env.id} says more") from fault
-    return evaluation_record(rollout) | missing_shares(env)
-
-
 def missing_shares(env: EnvConfig) -> dict[str, float]:
     """What an evaluation's record says of the observations that were missing."""
     return {"eval_flicker": env.flicker, "eval_drop_sensors": env.drop_sensors}
@@ -80,7 +57,8 @@ def policy_env(header: PolicyHeader, config: EnvConfig) -> Env:
     """An environment for a policy to act in. Raises ConfigError, also where its sizes are not the policy's."""
     env = first_env(config)
     try:
-        check_sizes(config.id, layout_sizes(header.layout), env_sizes(env))
+        layout = layout_of(env, config, {}, privileged=False)
+        check_sizes(config.id, layout_sizes(header.layout), layout_sizes(layout))
     except ConfigError:
         env.close()
         raise
@@ -90,16 +68,21 @@ def policy_env(header: PolicyHeader, config: EnvConfig) -> Env:
 def evaluate_policy(
     policy: PolicyFile, episodes: int, flicker: float | None = None, seconds: float = 0.0, watch: Watch = lambda _: None
 ) -> dict[str, Any]:
-    """Deterministic episodes of a policy, as ``evaluate_blob``, and where it comes from. Raises ConfigError."""
+    """Deterministic episodes of a policy, cut after ``seconds`` (0: never): its returns, and where it comes from.
+
+    Raises ConfigError where its environment cannot be made, or has other sizes than the policy; EnvFault where it
+    breaks in every episode.
+    """
     header = policy.header
-    return {
-        "env": header.env.id,
-        "preset": header.preset,
-        "seed": header.seed,
-        "env_steps": header.env_steps,
-        "updates": header.updates,
-        **evaluate_blob(header, policy.blob, episodes, flicker, seconds, watch),
-    }
+    env = header.env if flicker is None else dataclasses.replace(header.env, flicker=flicker)
+    runner, seed = policy_runner(header, policy.blob), first_start(header.seed, final=True)
+    with one_thread():
+        try:
+            rollout = play_episodes(runner, lambda: policy_env(header, env), episodes, seed, seconds, watch)
+        except EnvFault as fault:
+            raise EnvFault(f"{fault}; rmc check-env {env.id} says more") from fault
+    about = {name: getattr(header, name) for name in ("preset", "seed", "env_steps", "updates")}
+    return {"env": env.id, **about, **evaluation_record(rollout), **missing_shares(env)}
 
 
 def initial_policy(config: RunConfig) -> bytes:

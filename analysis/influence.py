@@ -17,6 +17,7 @@ from rmc.common.agent import Agent, MemoryOutput
 from rmc.common.critic import critic_input
 from rmc.common.window import Doubles
 
+QUANTITIES = ("h", "Q", "action")
 DELAYS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100, 150, 200, 300, 500, 700, 1_000)
 EPISODES = 8  # in which observations are changed
 LATER = 4  # observations changed in each of them, beside the first
@@ -29,9 +30,7 @@ class Influence:
     """By delay, medians over starts, each of the dimension that changes the most."""
 
     delays: tuple[int, ...]  # K
-    h: Doubles  # (K,)
-    q: Doubles  # (K,)
-    action: Doubles  # (K,)
+    changes: dict[str, Doubles]  # (K,) of each quantity
 
 
 class ReplayedEpisode:
@@ -114,9 +113,9 @@ def _of_starts(starts: list[tuple[ReplayedEpisode, int]], deviation: Tensor, spr
     left = np.array([replay.steps - 1 - start for replay, start in starts])
     delays = tuple(k for k in DELAYS if len(left) and (left >= k).mean() >= REACHED)
     if not delays:
-        return Influence((), *(np.zeros(0) for _ in spreads))
-    values = [_of_start(*one, deviation, spreads, delays) for one in starts]
-    return Influence(delays, *(np.nanmedian(np.stack(each), axis=0) for each in zip(*values, strict=True)))
+        return Influence((), {name: np.zeros(0) for name in QUANTITIES})
+    values = zip(*(_of_start(*one, deviation, spreads, delays) for one in starts), strict=True)
+    return Influence(delays, {name: np.nanmedian(each, axis=0) for name, each in zip(QUANTITIES, values, strict=True)})
 
 
 def _of_start(

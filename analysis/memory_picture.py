@@ -39,15 +39,10 @@ def examine_memory(agent: Agent, episodes: list[Episode], parts: list[HiddenPart
     return MemoryInsight(*influence(agent, episodes), probes(agent, episodes, parts))
 
 
-def curves(one: Influence) -> dict[str, list[float]]:
-    """By quantity, one value for each delay."""
-    return {"h": one.h.tolist(), "Q": one.q.tolist(), "action": one.action.tolist()}
-
-
 def draw(memory: MemoryInsight, axes: "list[Axes]") -> None:
     """Influence in the first of ``panels`` axes, probes in the second."""
     for name, one, style in (("first", memory.first, "-"), ("later", memory.later, "--")):
-        for quantity, values in curves(one).items():
+        for quantity, values in one.changes.items():
             label = f"{quantity}, {name} observation"
             axes[0].plot(one.delays, values, style, color=COLOURS[quantity], marker=".", label=label)
     axes[0].set_xscale("log")
@@ -86,7 +81,7 @@ def _influence_table(memory: MemoryInsight) -> Table:
     heads = [f"{k} step{'s' * (k > 1)} later" if k == delays[0] else f"{k:,}" for k in delays]
     table = plain_table(("changed observation", "changes", *heads))
     for name, one in (("first", memory.first), ("later", memory.later)):
-        for quantity, values in curves(one).items():
+        for quantity, values in one.changes.items():
             by_delay = dict(zip(one.delays, values, strict=True))
             table.add_row(name, quantity, *(f"{by_delay[k]:.0%}" if k in by_delay else "" for k in delays))
     return table

@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
 from numpy.typing import NDArray
 
 from rmc.analysis.curves import LABELS, Axis, curve, draw_agent
@@ -59,13 +60,8 @@ def returns(agents: dict[str, list[History]], by: Axis) -> str:
         panel.set_ylabel("evaluation return")
         panel.locator_params(axis="x", nbins=6)
         if by == "env_steps":
-            panel.xaxis.set_major_formatter(_steps)
+            panel.xaxis.set_major_formatter(EngFormatter(sep=""))
         return _drawn(figure)
-
-
-def _steps(value: float, _: float) -> str:
-    units = ((1e6, "M"), (1e3, "k"))
-    return next((f"{value / unit:g}{name}" for unit, name in units if abs(value) >= unit), f"{value:g}")
 
 
 def _time_unit(seconds: Sequence[float]) -> tuple[float, str]:

@@ -83,16 +83,10 @@ class ReportRun:
 
         Several replay servers each collect a share of the agent steps.
         """
-        series = self._metric(kind, name)
+        of_kind = (record for record in self.records if record["role"].partition("-")[0] == kind)
+        said = [record for record in of_kind if is_finite(record.get(name))]
         shares = self.options.get("replay.replay_shards", 1) if name == "env_steps_per_s" else 1
-        return self.wall_seconds([time for time, _ in series]), [shares * value for _, value in series]
-
-    def _metric(self, kind: str, name: str) -> list[tuple[float, float]]:
-        return [
-            (record["time"], float(record[name]))
-            for record in self.records
-            if record["role"].partition("-")[0] == kind and is_finite(record.get(name))
-        ]
+        return self.wall_seconds([one["time"] for one in said]), [float(shares * one[name]) for one in said]
 
     def wall_seconds(self, times: list[float]) -> list[float]:
         """Seconds trained at these times, over all starts of the run."""

@@ -87,8 +87,8 @@ def evaluator_starved(vitals: Vitals, config: RunConfig) -> Finding | None:
     """Checkpoints come faster than the evaluator plays them; those in between are passed over."""
     if not config.evaluator.episodes:
         return None
-    written = [value for _, value in vitals.series("learner", "checkpoint_update") if value > 0]
-    checkpoints = set(written) - set(_resumed_from(vitals))
+    said = [value for _, value in vitals.series("learner", "checkpoint_update")]
+    checkpoints = {value for value in said if value > 0} - set(said[:1])  # the first one an earlier start has played
     played = {value for _, value in vitals.series("evaluator", "eval_update")}
     missed = len(checkpoints - played)
     due = len(checkpoints) - 1  # the newest may be on its way
@@ -100,11 +100,6 @@ def evaluator_starved(vitals: Vitals, config: RunConfig) -> Finding | None:
     if fewer < config.evaluator.episodes:
         advice += f", --episodes {fewer} or a smaller --evaluation-seconds makes it faster"
     return Finding("evaluator starved", f"{missed} of {len(checkpoints)} checkpoints were not evaluated", advice)
-
-
-def _resumed_from(vitals: Vitals) -> list[float]:
-    """The checkpoint that the learner had in its first record, which an earlier start has played."""
-    return [value for _, value in vitals.series("learner", "checkpoint_update")[:1]]
 
 
 def stale_weights(vitals: Vitals, config: RunConfig) -> Finding | None:

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import safetensors.torch
 
-from rmc.analysis.evaluation import evaluate_blob, evaluate_policy
+from rmc.analysis.evaluation import evaluate_policy
 from rmc.analysis.history import objects
-from rmc.analysis.policy_file import read_policy
+from rmc.analysis.policy_file import PolicyFile, read_policy
 from rmc.analysis.world_model_picture import load_agent
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.deploy.run.folder import RunFolder
@@ -41,7 +41,8 @@ def play(job: Job, episodes: int = EPISODES) -> dict[str, Any]:
         steps.append(result["env_steps"])
         averaged.append(result["eval_return_mean"])
         blob = safetensors.torch.save(load_agent(folder, config, str(number)).policy_weights())
-        newest.append(evaluate_blob(config.policy_header(), blob, episodes)["eval_return_mean"])
+        policy = PolicyFile(config.policy_header(), blob)
+        newest.append(evaluate_policy(policy, episodes)["eval_return_mean"])
     about = {**job.values, "seed": job.seed}
     return about | {"env_steps": steps, "averaged": averaged, "newest": newest}
 

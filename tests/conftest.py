@@ -103,6 +103,13 @@ def one_thread() -> Iterator[None]:
 
 
 @pytest.fixture
+def short() -> Iterator[Path]:
+    """A folder that goes with the test; pytest's own are too long for a socket's path, of 107 bytes at most."""
+    with tempfile.TemporaryDirectory(prefix="rmc-") as folder:
+        yield Path(folder)
+
+
+@pytest.fixture
 def run_name(request: pytest.FixtureRequest) -> str:
     """A run name that no other test has."""
     return f"{request.node.name}-{os.urandom(4).hex()}"

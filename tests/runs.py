@@ -3,6 +3,7 @@
 import dataclasses
 import io
 import json
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,10 @@ AGENTS = {
     ),
     "paper": AgentConfig(hidden=16, embedding=0, heads=(10, 9), grounding=False),
 }
+RESULT = {
+    "env_steps": 1500, "updates": 336, "wall_s": 21.0, "eval_return_mean": 11.5, "eval_return_std": 0.5,
+    "eval_episodes": 10, "initial_return_mean": 5.0,
+}  # fmt: skip
 
 
 def untrained(path: Path, config: RunConfig | None = None, status: int | None = None) -> RunFolder:
@@ -38,6 +43,13 @@ def untrained(path: Path, config: RunConfig | None = None, status: int | None = 
     folder = open_run(config or debug(EnvConfig("InvertedPendulum-v5")), LaunchOptions(path))
     folder.lock.release(status)
     return folder
+
+
+def read_config(text: str | bytes) -> RunConfig:
+    """That of a run whose ``config.json`` says so. Raises ConfigError."""
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / "config.json").write_bytes(text.encode() if isinstance(text, str) else text)
+        return RunFolder(Path(folder)).config()
 
 
 def make_run(

@@ -181,12 +181,6 @@ class Supervisor:
 
     def start(self) -> None:
         """Start every role: first those that need no fork server, which takes its time to begin."""
-        try:
-            if self._fork_server is not None:
-                self._fork_server.start()
-        except OSError as error:  # the first role that needs it starts it
-            if error.errno not in NO_PROCESS:
-                raise
         for role in sorted(self.roles.values(), key=lambda role: role.command.single_thread):
             role.start_or_wait()
 

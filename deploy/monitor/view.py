@@ -2,7 +2,6 @@
 
 import sys
 import threading
-import time
 
 from rich.console import Console, RenderableType
 from rich.live import Live
@@ -26,8 +25,7 @@ class View:
     """A run's status shown on a console, live where that is a terminal; by a thread, whatever its owner waits for."""
 
     def __init__(self, status: RunStatus, console: Console) -> None:
-        self._status, self._console, self._due = status, console, 0.0
-        self._lock, self._over = threading.Lock(), threading.Event()
+        self._status, self._console, self._over = status, console, threading.Event()
         self._live: Live | None = None
         if console.is_terminal:
             self._live = Live(self._table(), console=console, auto_refresh=False)
@@ -36,15 +34,10 @@ class View:
         self._thread.start()
 
     def _draw(self) -> None:
-        while not self._over.wait(REFRESH_SECONDS):
-            self.refresh()
-
-    def refresh(self) -> None:
-        """Show the newest state if it is time."""
-        with self._lock:
-            if time.monotonic() >= self._due:
-                self._due = time.monotonic() + (REFRESH_SECONDS if self._live else LINE_SECONDS)
-                self._show()
+        seconds = REFRESH_SECONDS
+        while not self._over.wait(seconds):
+            self._show()
+            seconds = REFRESH_SECONDS if self._live else LINE_SECONDS
 
     def _show(self) -> None:
         if getattr(self._console.file, "lost", False):  # nobody sees it

@@ -88,16 +88,13 @@ class Hosts:
             name=actor_name(self._folder.name, name), namespace=NAMESPACE, lifetime="detached", get_if_exists=True,
             max_restarts=-1, num_cpus=place.cpus, num_gpus=place.gpus, scheduling_strategy=strategy,
         )  # fmt: skip
-        environment = {URL_VARIABLE: f"file:{{scratch}}/redis-url-{name}", PATIENCE_VARIABLE: str(PATIENCE_SECONDS)}
-        environment |= users_path()
-        run = self._folder
-        return options.remote(
-            Task(run.name, run.identity(), place.command, environment, self._secrets(name), working_folder())
-        )
+        environment = {URL_VARIABLE: self._url(name), PATIENCE_VARIABLE: str(PATIENCE_SECONDS), **users_path()}
+        secrets = self._secrets(name)
+        return options.remote(Task(self._folder.name, place.command, environment, secrets, working_folder()))
 
     def _secrets(self, name: str) -> dict[str, bytes]:
         """Files of a role's, by name; roles on one node share the folder that they are in."""
-        secrets = {f"redis-url-{name}": self._url(name).encode()}
+        secrets: dict[str, bytes] = {}
         if name == "learner" or name.startswith("replay"):
             secrets["secret"] = self._folder.secret()
         if self._encrypted:

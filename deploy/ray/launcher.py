@@ -8,14 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-try:
-    import ray
-    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
-except ImportError as missing:
-    from rmc.common.errors import ConfigError
-    from rmc.common.extra import how_to_install
-
-    raise ConfigError("--launcher", "ray", f"Ray is not installed; {how_to_install('ray')}") from missing
+import ray
+from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import ConfigError, first_line, last_line
@@ -99,7 +93,7 @@ def _created(config: RunConfig, folder: RunFolder) -> Any:
         name=actor_name(folder.name, "launcher"), namespace=NAMESPACE, lifetime="detached", max_restarts=-1, num_cpus=0,
         scheduling_strategy=NodeAffinitySchedulingStrategy(context.get_node_id(), soft=False),
     )  # fmt: skip
-    task = Task(folder.name, folder.identity(), command, users_path(), {}, working_folder())
+    task = Task(folder.name, command, users_path(), {}, working_folder())
     try:
         return actor.remote(task, str(folder.path), config.learner.keep_checkpoints)
     except ValueError:  # another has the name

@@ -116,11 +116,15 @@ class LauncherActor(RoleActor):
                 os.kill(self._role.pid, signal.SIGTERM)
         return attach.STOP_SECONDS + self._checkpoints.patience(0.0)
 
-    def claim(self, incarnation: str, address: str) -> bool:
-        """Be the host of the learner: no other's checkpoints are taken from now on. Whether the last was there, too."""
+    def claim(self, incarnation: str, address: str) -> tuple[bool, list[int], int, float]:
+        """Be the host of the learner: no other's checkpoints are taken from now on.
+
+        Whether the last was there, too; the checkpoints' numbers; the learner's epoch, and how long it took to save,
+        each 0 where there was none.
+        """
         before = self._claim.read_text().split() if self._claim.exists() else []
         write_whole(self._claim, f"{address} {incarnation}".encode())
-        return before[:1] == [address]
+        return before[:1] == [address], self.numbers(), self._checkpoints.last_epoch(), self._checkpoints.last_save()
 
     def archive(self, incarnation: str, number: int, files: dict[str, bytes], took: float) -> None:
         """Keep a checkpoint, and how long the learner took to save, if it comes from the learner's present host."""
@@ -132,15 +136,7 @@ class LauncherActor(RoleActor):
         """Keep the learner's epoch, likewise; returns what is kept."""
         if self._holds(incarnation):
             self._checkpoints.note_epoch(epoch)
-        return self.last_epoch()
-
-    def last_epoch(self) -> int:
-        """Of the learner; 0 where there was none."""
         return self._checkpoints.last_epoch()
-
-    def last_save(self) -> float:
-        """How long the learner's took; 0.0 where there was none."""
-        return self._checkpoints.last_save()
 
     def _holds(self, incarnation: str) -> bool:
         return self._claim.read_text().split()[1:] == [incarnation]

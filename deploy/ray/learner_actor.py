@@ -27,23 +27,21 @@ class LearnerActor(RoleActor):
     def prepare(self) -> None:
         folder = self.scratch / "checkpoints"
         self._folder = CheckpointFolder(folder)
-        launcher, was_here = self._claim(ray.util.get_node_ip_address())  # its id is another after each start of Ray
+        address = ray.util.get_node_ip_address()  # a node's id is another after each start of Ray
+        launcher, (was_here, kept, self._epoch, took) = self._claim(address)
         if not was_here:
             shutil.rmtree(folder, ignore_errors=True)  # of an earlier stay on this node: the run has gone on elsewhere
         local = self._folder.latest()
         newest = ray.get(launcher.newest.remote(local[0] if local is not None else -1))
         if newest is not None:
             self._folder.save(*newest)
-            self._folder.note_save(ray.get(launcher.last_save.remote()))
+            self._folder.note_save(took)
         begins = max((one[0] for one in (local, newest) if one is not None), default=-1)
-        self._archived = {
-            one for one in ray.get(launcher.numbers.remote()) if one <= begins
-        }  # above it are damaged ones
-        self._epoch: int = ray.get(launcher.last_epoch.remote())
+        self._archived = max((one for one in kept if one <= begins), default=-1)  # above it are damaged ones
         self._folder.note_epoch(max(self._epoch, self._folder.last_epoch()))
 
-    def _claim(self, address: str) -> tuple[Any, bool]:
-        """The launcher, and whether the learner was here before."""
+    def _claim(self, address: str) -> tuple[Any, tuple[bool, list[int], int, float]]:
+        """The launcher, and what it answers."""
         deadline = time.monotonic() + CLAIM_SECONDS
         while True:
             try:
@@ -66,10 +64,9 @@ class LearnerActor(RoleActor):
             raise
 
     def _bring(self) -> None:
-        newest, took = max(self._archived, default=-1), self._folder.last_save()
-        numbers = self._folder.numbers()
+        numbers, took = self._folder.numbers(), self._folder.last_save()
         for number in numbers:
-            if number > newest and number not in self._archived:
+            if number > self._archived:
                 try:
                     files = self._folder.load(number)
                 except CheckpointError:  # damaged, or dropped since
@@ -77,7 +74,7 @@ class LearnerActor(RoleActor):
                         raise
                     continue
                 ray.get(self._launcher().archive.remote(self._incarnation, number, files, took))
-                self._archived.add(number)
+                self._archived = number
         epoch = self._folder.last_epoch()
         if epoch > self._epoch:
             self._epoch = ray.get(self._launcher().note_epoch.remote(self._incarnation, epoch))

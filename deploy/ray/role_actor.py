@@ -41,12 +41,11 @@ class Task:
     """
 
     run: str
-    scratch: str
-    """By which its folder on the node is called."""
+    """Its end, the run folder's identity, names the scratch folder."""
     command: RoleCommand
-    environment: dict[str, str]
+    environment: dict[str, str] = field(repr=False)
     secrets: dict[str, bytes] = field(repr=False)
-    """Text files that only the owner may read, by name, in the scratch folder."""
+    """Files that only the owner may read, by name, in the scratch folder."""
     working_folder: str
     """Where the launcher was started; roles start there, too, where the node has such a folder."""
 
@@ -102,7 +101,7 @@ class RoleActor:
         descendants.spare_children()  # Ray's own
         self._replaced = self._run_ends = False
         self.trouble = ""
-        self.scratch = scratch_folder(task.scratch)
+        self.scratch = scratch_folder(task.run.rpartition("-")[2])
         self._write_secrets()
         self._status: int | None = None
         self.prepare()
@@ -114,7 +113,7 @@ class RoleActor:
 
     def _write_secrets(self) -> None:
         for name, content in self._task.secrets.items():
-            write_private(self.scratch / name, self._filled(content.decode()).encode())
+            write_private(self.scratch / name, content)
 
     def _filled(self, text: str) -> str:
         return (

@@ -23,7 +23,7 @@ class ProgressBackup:
     def __init__(self, folder: RunFolder, shards: int) -> None:
         self._path = folder.path / "replay-counters"
         self._roles = [Shard(index, shards).role for index in range(shards)]
-        self._keep_at = 0.0
+        self._kept, self._keep_at = self._read(), 0.0
 
     def keep(self, bus: Bus, at_once: bool = False) -> None:
         """Copy them, once in a while."""
@@ -33,34 +33,25 @@ class ProgressBackup:
         with suppress(BusUnavailable, BusFull, OSError):  # the disk is full: those before stay
             progress = {role: raw for role in self._roles if (raw := bus.progress(role)) is not None}
             if progress and all(map(crc_matches, progress.values())):
-                write_whole(self._path, msgpack.packb(self._before() | progress))
+                self._kept |= progress  # what a replay server that is away had counted stays
+                write_whole(self._path, msgpack.packb(self._kept))
 
     def restore(self, bus: Bus) -> None:
-        """Restore the counters in Redis where it has none; a replay server with an older ring goes on from them.
-
-        A file that cannot be read is told, and does not keep the run from going on: most often the ring has them, too.
-        """
-        try:
-            progress = self._kept()
-        except (OSError, ValueError) as error:
-            log.warning("%s: cannot be read (%s); going on without what it counted", self._path, error)
-            return
-        for role, raw in progress.items():
+        """Restore the counters in Redis where it has none; a replay server with an older ring goes on from them."""
+        for role, raw in self._kept.items():
             bus.set_progress(role, raw)
 
-    def _before(self) -> dict[str, bytes]:
-        """What a replay server that is away had counted stays."""
-        with suppress(OSError, ValueError):
-            return self._kept()
-        return {}
-
-    def _kept(self) -> dict[str, bytes]:
-        """By role. Raises OSError, ValueError."""
-        if not self._path.exists():
+    def _read(self) -> dict[str, bytes]:
+        """By role. A damaged file is told, and does not keep the run from going on: most often the ring has them."""
+        try:
+            progress = msgpack.unpackb(self._path.read_bytes())
+            if not isinstance(progress, dict) or not all(
+                role in self._roles and isinstance(raw, bytes) and crc_matches(raw) for role, raw in progress.items()
+            ):
+                raise ValueError("damaged, or no counters of this run's replay servers")
+        except FileNotFoundError:
             return {}
-        progress = msgpack.unpackb(self._path.read_bytes())
-        if not isinstance(progress, dict) or not all(
-            role in self._roles and isinstance(raw, bytes) and crc_matches(raw) for role, raw in progress.items()
-        ):
-            raise ValueError("damaged, or no counters of this run's replay servers")
+        except (OSError, ValueError) as error:
+            log.warning("%s: cannot be read (%s); going on without what it counted", self._path, error)
+            return {}
         return progress

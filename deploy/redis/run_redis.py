@@ -23,19 +23,17 @@ class RunRedis:
     def __init__(
         self, config: RunConfig, folder: RunFolder, stop: StopSignal, url: str | None = None, port: Port | None = None
     ) -> None:
-        self._folder, self._url, self._leave = folder, url, ExitStack()
+        self._folder, self._url = folder, url
         self._socket_folder = SocketFolder()
-        self._leave.callback(self._socket_folder.close)
         self.sockets = self._socket_folder.path
-        try:
+        with ExitStack() as leave:
+            leave.callback(self._socket_folder.close)
             self._server = None if url else RedisServer(self.sockets, port=port, users=self._users(config))
             if self._server is not None:
-                self._leave.enter_context(self._server)
+                leave.enter_context(self._server)
             self.bus: RedisBus = connect(self.url(LAUNCHER), folder.name)
             self._registration = tried_again(lambda: Registration(config, folder, self.bus), stop)
-        except BaseException:
-            self._leave.close()
-            raise
+            self._leave = leave.pop_all()
 
     def _users(self, config: RunConfig) -> RedisUsers:
         return RedisUsers(self._folder.name, self._folder.secret(), config.roles())

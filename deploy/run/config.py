@@ -25,7 +25,7 @@ from rmc.common.policy_header import PolicyHeader
 from rmc.common.shard import Shard
 from rmc.common.window import WindowSpec
 from rmc.deploy.run.env_sizes import FLAGS, layout_sizes
-from rmc.deploy.run.migrations import FORMAT, migrated
+from rmc.deploy.run.migrations import FORMAT
 from rmc.deploy.run.option_names import flat
 from rmc.learner.config import LearnerConfig, UpdateConfig
 from rmc.replay_server.config import ReplayConfig
@@ -139,11 +139,6 @@ def to_json(config: RunConfig) -> str:
     return json.dumps({"format": FORMAT} | dataclasses.asdict(config), indent=2)
 
 
-def from_json(text: str | bytes) -> RunConfig:
-    """The config again, also an older version's. Raises ConfigError on anything unknown, missing or of a wrong type."""
-    return from_dict(RunConfig, migrated(_read(text)), "config.json ")
-
-
 def checked(config: RunConfig) -> RunConfig:
     """The same, as it would come out of ``config.json``. Raises ConfigError for a value of a wrong type or choice."""
     if not isinstance(config, RunConfig):
@@ -169,20 +164,16 @@ def to_registration(config: RunConfig) -> bytes:
 
 def from_registration(text: bytes) -> RunConfig:
     """The config again. Raises ConfigError."""
-    raw = _read(text)
+    try:
+        raw = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ConfigError("config.json", str(error), "not JSON; restore the file or start a new run") from None
     if isinstance(raw, dict):
         raw.pop("start", None)
     layout: Any = raw.pop("layout", None) if isinstance(raw, dict) else None
     config = from_dict(RunConfig, raw, "config.json ")
     config.__dict__["layout"] = from_dict(EnvLayout, layout, "layout ")  # where the cached property keeps it
     return config
-
-
-def _read(text: str | bytes) -> Any:
-    try:
-        return json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise ConfigError("config.json", str(error), "not JSON; restore the file or start a new run") from None
 
 
 def from_dict(kind: type[ConfigT], raw: Any, path: str) -> ConfigT:

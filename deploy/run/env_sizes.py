@@ -3,27 +3,15 @@
 from typing import Any
 
 from rmc.common.env.layout import EnvLayout
-from rmc.common.env.spaces import bounds
-from rmc.common.env.wrappers import Env
 from rmc.common.errors import ConfigError
 
 FLAGS = "flags of what is missing"
-LOWEST, HIGHEST = "the lowest actions", "the highest actions"
 
 
 def layout_sizes(layout: EnvLayout) -> dict[str, Any]:
     """Those that every agent depends on, as ``RunConfig.sizes`` names them."""
-    extremes = {LOWEST: list(layout.action_low), HIGHEST: list(layout.action_high)}
+    extremes = {"the lowest actions": list(layout.action_low), "the highest actions": list(layout.action_high)}
     return {"observations": layout.obs_dim, "actions": layout.action_dim, **extremes}
-
-
-def env_sizes(env: Env) -> dict[str, Any]:
-    """The same of an environment as ``make_env`` gives it."""
-    assert env.observation_space.shape
-    assert env.action_space.shape
-    low, high = bounds(env.get_wrapper_attr("raw_action_space"))
-    sizes = {"observations": env.observation_space.shape[0], "actions": env.action_space.shape[0]}
-    return {**sizes, LOWEST: low.tolist(), HIGHEST: high.tolist()}
 
 
 def check_sizes(env_id: str, before: dict[str, Any], sizes: dict[str, Any]) -> None:

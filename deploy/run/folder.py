@@ -18,7 +18,7 @@ from typing import Any
 from rmc.common.bus.metrics_record import is_finite, is_metric, is_plain
 from rmc.common.errors import ConfigError
 from rmc.common.whole_file import NO_ROOM, private_temporary, write_synced, write_whole
-from rmc.deploy.run.config import RunConfig, from_json, to_json
+from rmc.deploy.run.config import RunConfig, from_dict, to_json
 from rmc.deploy.run.env_sizes import check_sizes
 from rmc.deploy.run.migrations import migrated
 from rmc.deploy.run.option_names import did_you_mean
@@ -99,8 +99,7 @@ class RunFolder:
         except OSError as error:
             raise ConfigError("RUN", str(self.path), f"config.json cannot be read ({error.strerror})") from None
         try:
-            settings: dict[str, Any] = migrated(raw)
-            return settings
+            return migrated(raw)
         except ConfigError as error:
             raise ConfigError("RUN", str(self.path), str(error)) from None
 
@@ -121,11 +120,12 @@ class RunFolder:
 
     def config(self) -> RunConfig:
         """The run's config. Raises ConfigError, which names the folder, where it cannot be read or is a baseline's."""
-        if self.is_baseline():
+        settings = self.settings()
+        if "algorithm" in settings:
             fix = "is a baseline's run; only rmc evaluate, plot, report, stats, watch, resume and stop take it"
             raise ConfigError("RUN", str(self.path), fix)
         try:
-            return from_json((self.path / "config.json").read_bytes())
+            return from_dict(RunConfig, settings, "config.json ")
         except ConfigError as error:
             raise ConfigError("RUN", str(self.path), str(error)) from None
 

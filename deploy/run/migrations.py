@@ -46,13 +46,8 @@ MIGRATIONS: list[Callable[[Raw], None]] = [_to_2, _to_3, _to_4, _to_5, _to_6, _t
 FORMAT = 1 + len(MIGRATIONS)
 
 
-def migrated(raw: Any) -> Any:
-    """The same in this version's words, without its ``format``; what is no object is left for others to judge.
-
-    Raises ConfigError for a newer format.
-    """
-    if not isinstance(raw, dict):
-        return raw
+def migrated(raw: Raw) -> Raw:
+    """The same in this version's words, without its ``format``. Raises ConfigError for a newer format."""
     settings = {name: dict(part) if isinstance(part, dict) else part for name, part in raw.items()}
     was = settings.pop("format", 1)
     if type(was) is not int or was < 1:

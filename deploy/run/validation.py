@@ -1,13 +1,11 @@
 """Which configurations make no sense; numbers of the environment are judged in ``common/env/config.py``."""
 
-from typing import Any
-
 from rmc.common.bus.redis_url import redacted
 from rmc.common.env.config import check_env_config, check_range
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig, WindowConfig
 from rmc.deploy.run.launch_options import LaunchOptions
-from rmc.deploy.run.option_names import option
+from rmc.deploy.run.option_names import flat, option
 
 RANGES: dict[str, tuple[float, float]] = {  # both ends included
     "seed": (0, 2**63 - 1),
@@ -56,11 +54,9 @@ RANGES: dict[str, tuple[float, float]] = {  # both ends included
 def validate(config: RunConfig) -> None:
     """Raises ConfigError for the first value that makes no sense."""
     check_env_config(config.env)
+    values = flat(config)
     for path, limits in RANGES.items():
-        value: Any = config
-        for name in path.split("."):
-            value = getattr(value, name)
-        check_range(option(path), value, limits)
+        check_range(option(path), values[path], limits)
     _validate_agent(config)
     _validate_actors(config)
     if config.total_steps <= config.replay.warmup_steps:

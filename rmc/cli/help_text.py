@@ -29,12 +29,8 @@ def only_basic(command: Any, names: Set[str]) -> Any:
         if dataclasses.is_dataclass(value):
             changed.append((name, type(value), dataclasses.field(default=value)))
         elif name not in names:
-            default = dataclasses.field(default_factory=functools.partial(_same, value))
+            default = dataclasses.field(default_factory=functools.partial(lambda same: same, value))
             changed.append((name, Annotated[hints[name], tyro.conf.Suppress], default))
     shown = dataclasses.make_dataclass(kind.__name__, changed, bases=(kind,), frozen=True, kw_only=True)
     shown.__doc__ = kind.__doc__
     return shown(**values)
-
-
-def _same(value: Any) -> Any:
-    return value

@@ -5,6 +5,7 @@ import errno
 import io
 import logging
 import os
+import pkgutil
 import sys
 
 from rmc.common.errors import CONFIG_STATUS, STOPPED_STATUS, ConfigError, RmcError
@@ -144,7 +145,8 @@ def _parse_and_run(words: list[str]) -> int:
         return _complain(_complaint([without_passwords(word) for word in words]), CONFIG_STATUS)
     for url in option_values("--redis-url", words):  # one in a file is not seen in ps
         warn_of_password(url)
-    return parser.ACTIONS[type(command)](command)
+    status: int = pkgutil.resolve_name(f"rmc.cli.{parser.ACTIONS[type(command)]}")(command)
+    return status
 
 
 def _complaint(words: list[str]) -> str:

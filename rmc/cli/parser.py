@@ -2,12 +2,9 @@
 
 import dataclasses
 import functools
-import importlib
 import logging
 import operator
-from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import Annotated, Any, get_args, get_type_hints
 
 import tyro
@@ -33,42 +30,27 @@ DESCRIPTION = (
     "Begin with: rmc train InvertedPendulum-v5 --preset debug. rmc --version says which version this is."
 )
 FLAT = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
-
-
-@dataclass(frozen=True)
-class Action:
-    """What runs a command: a function of a module that is imported when it is called, as many are slow to import."""
-
-    module: str
-    function: str
-
-    def __call__(self, command: Any) -> int:
-        """Run it; its exit status."""
-        run: Callable[[Any], int] = getattr(importlib.import_module(f"rmc.cli.{self.module}"), self.function)
-        return run(command)
-
-
-COMMANDS: dict[str, tuple[type, Action]] = {
-    "train": (train_options.Train, Action("commands", "train")),
-    "sweep": (sweep_options.Sweep, Action("sweep_command", "sweep")),
-    "resume": (train_options.Resume, Action("commands", "train")),
-    "evaluate": (run_options.Evaluate, Action("policy_commands", "evaluate")),
-    "export": (run_options.Export, Action("policy_commands", "export_policy")),
-    "inspect": (run_options.Inspect, Action("policy_commands", "inspect")),
-    "check-env": (run_options.CheckEnv, Action("analysis_commands", "check_env")),
-    "baseline": (run_options.Baseline, Action("policy_commands", "baseline")),
-    "plot": (run_options.Plot, Action("analysis_commands", "plot")),
-    "hub": (hub_options.Hub, Action("hub_commands", "run_hub")),
-    "report": (run_options.Report, Action("analysis_commands", "report")),
-    "doctor": (run_options.Doctor, Action("commands", "doctor")),
-    "stats": (run_options.Stats, Action("commands", "stats")),
-    "list": (run_options.List, Action("commands", "list_runs")),
-    "watch": (run_options.Watch, Action("watch_command", "watch")),
-    "attach": (run_options.Attach, Action("commands", "attach")),
-    "stop": (run_options.Stop, Action("commands", "stop")),
-    "cluster": (run_options.Cluster, Action("commands", "cluster")),
-    "completion": (run_options.Completion, Action("completion", "print_script")),
-    "role": (role_options.Role, Action("role_commands", "run_role")),
+COMMANDS: dict[str, tuple[type, str]] = {  # and what runs each, of rmc.cli: imported then, as many are slow to import
+    "train": (train_options.Train, "commands:train"),
+    "sweep": (sweep_options.Sweep, "sweep_command:sweep"),
+    "resume": (train_options.Resume, "commands:train"),
+    "evaluate": (run_options.Evaluate, "policy_commands:evaluate"),
+    "export": (run_options.Export, "policy_commands:export_policy"),
+    "inspect": (run_options.Inspect, "policy_commands:inspect"),
+    "check-env": (run_options.CheckEnv, "analysis_commands:check_env"),
+    "baseline": (run_options.Baseline, "policy_commands:baseline"),
+    "plot": (run_options.Plot, "analysis_commands:plot"),
+    "hub": (hub_options.Hub, "hub_commands:run_hub"),
+    "report": (run_options.Report, "analysis_commands:report"),
+    "doctor": (run_options.Doctor, "commands:doctor"),
+    "stats": (run_options.Stats, "commands:stats"),
+    "list": (run_options.List, "commands:list_runs"),
+    "watch": (run_options.Watch, "watch_command:watch"),
+    "attach": (run_options.Attach, "commands:attach"),
+    "stop": (run_options.Stop, "commands:stop"),
+    "cluster": (run_options.Cluster, "commands:cluster"),
+    "completion": (run_options.Completion, "completion:print_script"),
+    "role": (role_options.Role, "role_commands:run_role"),
 }
 ACTIONS = dict(COMMANDS.values()) | {run_options.ResumeBaseline: COMMANDS["baseline"][1]}
 

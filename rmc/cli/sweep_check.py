@@ -20,11 +20,7 @@ from rmc.deploy.run.preflight import check_machine
 from rmc.deploy.run.tracking import choose_tracking
 from rmc.deploy.run.validation import validate, validate_launch
 from rmc.sweep.job import Job
-from rmc.sweep.spec import EVERY_RUNS, Range, Spec, check_name
-
-RESERVED = (
-    "run_dir", "if_exists", "redis_url", "ray_address", "all_cpus", "tls", "metrics_port", "metrics_host", "dry_run",
-)  # fmt: skip
+from rmc.sweep.spec import EVERY_RUNS, Range, Search, Spec, check_name
 
 
 @dataclass(frozen=True)
@@ -44,42 +40,34 @@ def with_file(spec: Spec) -> Spec:
     path = config_file.named(spec.words)
     if path is None:
         return spec
-    words, said = config_file.without_file(spec.words), []
-    ranges = spec.search.ranges if spec.search is not None else {}
-    own = {word.partition("=")[0].replace("_", "-") for word in words}.union(
-        map(option, (*spec.options, *spec.grid, *ranges))
-    )
+    words: list[str] = []
     for name, value in config_file.read_options(path, parser.option_names(Train))[1].items():
         check_name(f"{config_file.OPTION} {path}: {name}", name, value, EVERY_RUNS)
-        if option(name) not in own:
-            said += option_words(name, value)
-    return dataclasses.replace(spec, words=(*said, *words))
+        if option(name) not in spec.said():
+            words += option_words(name, value)
+    return dataclasses.replace(spec, words=(*words, *config_file.without_file(spec.words)))
 
 
 def check_values(spec: Spec, on_this_machine: bool) -> None:
     """Raises ConfigError, which names the key, for the first value that rmc train would not read."""
     given = {word.partition("=")[0].replace("_", "-") for word in spec.words}
     typed = " ".join(map(without_passwords, spec.words))
-    ranges = spec.search.ranges if spec.search is not None else {}
-    named = given | {option(name) for name in (*spec.options, *spec.grid, *ranges)}
-    if not on_this_machine and "--init-from" in named:
+    if not on_this_machine and "--init-from" in spec.said():
         raise ConfigError("--init-from", typed, "the nodes do not have that file; leave it")
     if "--seed" in given:
         raise ConfigError("--seed", typed, "a sweep has several: give --seeds")
-    for name in RESERVED:
-        if option(name) in given:
+    for name in parser.option_names(Train):
+        if name not in EVERY_RUNS and option(name) in given:
             raise ConfigError(option(name), typed, "a sweep's runs are given none; leave it")
     _check("options of rmc train", typed, spec, list(spec.words))
-    for name, sought in ranges.items():
+    search, options = spec.search or Search({}), {name: [value] for name, value in spec.options.items()}
+    for name, sought in search.ranges.items():
         if isinstance(sought, Range):
             is_integer(name, read_job(Job(Path(), ("train", spec.env, *spec.words), 0))[0])
-    for part, values in (("options", {name: [value] for name, value in spec.options.items()}), ("grid", spec.grid)):
+    for part, values in (("options", options), ("grid", spec.grid), ("search", search.ends())):
         for name, tried in values.items():
             for value in tried:
                 _check(f"{part}.{name}", value, spec, option_words(name, value))
-    for name, tried in (spec.search.ends() if spec.search is not None else {}).items():
-        for value in tried:
-            _check(f"search.{name}", value, spec, option_words(name, value))
 
 
 def _check(place: str, value: Any, spec: Spec, words: list[str]) -> None:

@@ -1,5 +1,6 @@
 """``rmc sweep``: from its checks to its table."""
 
+import dataclasses
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
@@ -13,6 +14,7 @@ from rmc.cli.signals import signals_caught
 from rmc.cli.sweep_check import Checked
 from rmc.cli.sweep_options import Sweep
 from rmc.common.errors import STOPPED_STATUS, ConfigError
+from rmc.common.extra import check_installed
 from rmc.common.user_path import user_path
 from rmc.deploy.monitor.view import terminal
 from rmc.deploy.run.config import RunConfig
@@ -47,6 +49,8 @@ def sweep(command: Sweep) -> int:
     if on_this_machine and command.ray_address != "auto":
         raise ConfigError("--ray-address", command.ray_address, "give --launcher ray, or leave it")
     sweep_check.check_values(spec, on_this_machine)
+    if not on_this_machine and "--threads" not in spec.said():  # by itself a learner would try all of a node's cores
+        spec = dataclasses.replace(spec, words=("--threads=1", *spec.words))
     jobs = grid_jobs(spec, folder) if spec.search is None else corner_jobs(spec, spec.search, folder)
     checked = sweep_check.check_jobs(jobs, on_this_machine)
     with closing(Index(folder)) as index:
@@ -121,6 +125,7 @@ def grid_work(checked: list[Checked], index: Index) -> Work:
 
 def search_work(spec: Spec, search: Search, config: RunConfig, index: Index, folder: Path) -> Work:
     """All trials that are missing. Raises ConfigError."""
+    check_installed("optuna", ("optuna",), "search", "")
     from rmc.sweep.search import SearchPlan, distribution  # an extra
 
     distributions = {

@@ -194,12 +194,13 @@ def _before(config: RunConfig, folder: RunFolder, seconds: float, console: Conso
     if kept is not None:
         return kept
     from rmc.analysis import evaluation  # imports torch
+    from rmc.analysis.policy_file import PolicyFile
 
     number, files = CheckpointFolder(folder.checkpoints).latest() or (0, {})
-    policy = files[POLICY] if files and number == 0 else evaluation.initial_policy(config)
+    blob = files[POLICY] if files and number == 0 else evaluation.initial_policy(config)
+    policy = PolicyFile(config.policy_header(), blob)
     progress = evaluation.EvaluationProgress(console, "before training")
-    header, episodes = config.policy_header(), evaluation.FINAL_EPISODES
-    played = evaluation.evaluate_blob(header, policy, episodes, None, seconds, progress)
+    played = evaluation.evaluate_policy(policy, evaluation.FINAL_EPISODES, None, seconds, progress)
     folder.write_initial(played)
     return played
 

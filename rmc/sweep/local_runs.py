@@ -5,9 +5,7 @@ import signal
 import subprocess
 from pathlib import Path
 
-from rmc.common.env.process_state import our_variables
-from rmc.common.process.parent_death import PARENT_VARIABLE
-from rmc.deploy.local.role_environment import command_line
+from rmc.deploy.local.role_environment import command_line, start_process
 from rmc.deploy.run.host import cores
 from rmc.sweep.job import Job
 
@@ -61,12 +59,8 @@ def core_parts(count: int) -> list[set[int]]:
 def spawn(words: list[str], log: Path) -> "subprocess.Popen[bytes]":
     """``rmc`` as a process that ends with this one, and that a terminal's Ctrl-C does not reach."""
     log.parent.mkdir(parents=True, exist_ok=True)
-    environment = our_variables() | {PARENT_VARIABLE: str(os.getpid())}
     with log.open("ab") as output:
-        return subprocess.Popen(
-            command_line(words),
-            stdin=subprocess.DEVNULL, stdout=output, stderr=output, env=environment, start_new_session=True,
-        )  # fmt: skip
+        return start_process(command_line(words), output, {})
 
 
 def last_log_line(log: Path) -> str:

@@ -57,12 +57,6 @@ class RayRuns:
         self._running -= 1
 
 
-def on_reserved_cores(words: tuple[str, ...]) -> tuple[str, ...]:
-    """A run's words, with the one thread that is reserved for its learner: by itself it would try all of the node's."""
-    named = any(word.partition("=")[0] == "--threads" for word in words)
-    return words if named else (*words, "--threads", "1")
-
-
 class RayRun:
     """A run on some node, whose files are copied here again and again; nothing here waits for the node."""
 
@@ -70,8 +64,7 @@ class RayRun:
         self._runs, self._job, self._lost = runs, job, ""
         self._log = job.log.read_bytes() if job.log.exists() else b""
         brought = pack(job.folder, {}) if job.folder.exists() else Parcel()
-        words = on_reserved_cores(job.words)
-        self._actor = ray.remote(NodeRun).options(**needs).remote(words, job.name, brought, os.getcwd())
+        self._actor = ray.remote(NodeRun).options(**needs).remote(job.words, job.name, brought, os.getcwd())
         self._stamps: Stamps = brought.stamps  # of its files, those that are here
         self._pending: Any = self._actor.look.remote(self._stamps, True)
         self._begun, self._look_at, self._copy_at = False, 0.0, 0.0

@@ -8,15 +8,8 @@ import json
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-try:
-    import optuna
-except ImportError as missing:
-    from rmc.common.errors import ConfigError
-    from rmc.common.extra import how_to_install
-
-    raise ConfigError("search", "", f"Optuna is not installed; {how_to_install('optuna')}") from missing
-
 import numpy as np
+import optuna
 from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
 from optuna.trial import TrialState
 
@@ -52,9 +45,7 @@ class SearchPlan:
         self._is_finished = is_finished
         self._checkpoint_steps = checkpoint_steps
         pruner = optuna.pruners.MedianPruner(STARTUP_TRIALS, FIRST_JUDGED)
-        self._study = optuna.create_study(
-            direction="maximize", pruner=pruner if search.prune else optuna.pruners.NopPruner()
-        )
+        self._study = optuna.create_study(direction="maximize", pruner=pruner)
         self._at_work: dict[str, _Trial] = {}
         self.todo: list[Job] = []
         self._index = index

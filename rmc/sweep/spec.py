@@ -15,7 +15,7 @@ from rmc.common.bus.metrics_record import is_finite
 from rmc.common.bus.redis_url import value_without_passwords
 from rmc.common.env.config import PYTHONS, EnvConfig, check_kwargs
 from rmc.common.errors import ConfigError
-from rmc.deploy.run.option_names import did_you_mean, flat, plain_names, read_toml
+from rmc.deploy.run.option_names import did_you_mean, flat, option, plain_names, read_toml
 from rmc.deploy.run.presets import robust
 
 KEYS = ("env", "seeds", "options", "grid", "search")
@@ -87,6 +87,11 @@ class Spec:
         for name in [*self.options, *typed]:
             if (plain := name.removeprefix("no_")) in varied:
                 raise ConfigError(name, varied[plain], "is an option of every run and varied, too; leave one of them")
+
+    def said(self) -> set[str]:
+        """The options that are typed, that every run has, or that are varied."""
+        typed = {word.partition("=")[0].replace("_", "-") for word in self.words}
+        return typed.union(map(option, (*self.options, *self.grid, *(self.search.ranges if self.search else {}))))
 
     def _check_search(self, search: Search) -> None:
         if self.grid:
@@ -197,10 +202,7 @@ def read_seeds(raw: Any) -> tuple[int, ...]:
 
 def read_grid(words: Sequence[str]) -> dict[str, list[Any]]:
     """Of ``NAME=VALUE,VALUE…`` words. Raises ConfigError."""
-    grid: dict[str, list[Any]] = {}
-    for name, text in _pairs("--grid", words):
-        grid[name] = read_values(text)
-    return grid
+    return {name: read_values(text) for name, text in _pairs("--grid", words)}
 
 
 def read_ranges(words: Sequence[str]) -> dict[str, Range | list[Any]]:

@@ -4,7 +4,9 @@ import dataclasses
 import json
 import pickle
 import re
+import shutil
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 from typing import get_args
 
@@ -17,7 +19,6 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from rmc import api
 from rmc.analysis import baseline_settings, baselines
-from rmc.analysis.baseline_model import BaselineModel
 from rmc.analysis.baseline_settings import Algorithm, BaselineConfig, Settings, choose, read_config
 from rmc.analysis.baselines import evaluate, train
 from rmc.analysis.history import of_run
@@ -38,10 +39,12 @@ ALGORITHMS = get_args(Algorithm)
 TRAINED_BELOW = "sac", "td3", "ppo"  # and gone on with
 
 
-@pytest.fixture(autouse=True)
-def small_networks(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(autouse=True, scope="module")
+def small_networks() -> Iterator[None]:
     """Of the settings ``paper``: an update of theirs takes 23 ms."""
-    monkeypatch.setattr(baseline_settings, "PAPER_NET", [16, 16])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(baseline_settings, "PAPER_NET", [16, 16])
+        yield
 
 
 def config(algorithm: Algorithm = "sac", settings: Settings = "paper", **other) -> BaselineConfig:
@@ -52,6 +55,25 @@ def config(algorithm: Algorithm = "sac", settings: Settings = "paper", **other) 
 
 def run(settings: BaselineConfig, folder, stop: StopSignal | None = None) -> int:
     return train(settings, folder, Console(quiet=True), stop or StopSignal())
+
+
+@pytest.fixture(scope="module")
+def finished(small_networks, tmp_path_factory) -> Path:
+    """A run that is over; nobody changes it."""
+    folder = tmp_path_factory.mktemp("sac") / "run"
+    assert run(config(total_steps=200), folder) == 0
+    return folder
+
+
+ZOO = config("ppo", "zoo", env=EnvConfig("Hopper-v5"), total_steps=600, checkpoint_steps=300)
+
+
+@pytest.fixture(scope="module")
+def zoo(tmp_path_factory) -> Path:
+    """The same of the zoo's PPO."""
+    folder = tmp_path_factory.mktemp("zoo") / "run"
+    assert run(ZOO, folder) == 0
+    return folder
 
 
 @pytest.mark.parametrize(
@@ -105,31 +127,29 @@ def test_it_speaks_while_it_plays(tmp_path, monkeypatch):
     assert wall_seconds(folder.metrics) <= result["wall_s"]  # without the last evaluation
 
 
-def test_tensorboard_draws_its_evaluations(tmp_path):
-    assert run(config(total_steps=200), tmp_path / "run") == 0
-    events = EventAccumulator(str(tmp_path / "run")).Reload().Scalars("Main/evaluation_return")
-    records = [record for record in RunFolder(tmp_path / "run").records() if record["role"] == "evaluator"]
+def test_tensorboard_draws_its_evaluations(finished):
+    events = EventAccumulator(str(finished)).Reload().Scalars("Main/evaluation_return")
+    records = [record for record in RunFolder(finished).records() if record["role"] == "evaluator"]
     assert [event.step for event in events] == [record["eval_env_steps"] for record in records] == [100, 200]
     assert [event.value for event in events] == pytest.approx([record["eval_return_mean"] for record in records])
 
 
-def test_its_last_state_is_played_by_rmc_evaluate(tmp_path, capsys):
-    run(config("ppo", "zoo", env=EnvConfig("Hopper-v5"), total_steps=600), tmp_path / "run")
+def test_its_last_state_is_played_by_rmc_evaluate(zoo, capsys):
     torch.set_num_threads(2)  # as a process has it that has trained nothing
-    assert rmc(["evaluate", str(tmp_path / "run"), "--episodes", "10", "--flicker", "0", "1", "--json"]) == 0
+    assert rmc(["evaluate", str(zoo), "--episodes", "10", "--flicker", "0", "1", "--json"]) == 0
     assert torch.get_num_threads() == 1
     seen, blind = (json.loads(line) for line in capsys.readouterr().out.splitlines())
-    result = RunFolder(tmp_path / "run").result()
+    result = RunFolder(zoo).result()
     assert seen["eval_return_mean"] == result["eval_return_mean"]
     assert (blind["eval_flicker"], blind["env_steps"]) == (1.0, result["env_steps"])
-    assert rmc(["evaluate", str(tmp_path / "run"), "--checkpoint", "best"]) == 2
+    assert rmc(["evaluate", str(zoo), "--checkpoint", "best"]) == 2
     before = _random_state(), torch.get_rng_state().tolist()
-    assert api.evaluate(tmp_path / "run", flicker=0.0)["eval_return_mean"] == result["eval_return_mean"]
+    assert api.evaluate(zoo, flicker=0.0)["eval_return_mean"] == result["eval_return_mean"]
     assert (_random_state(), torch.get_rng_state().tolist()) == before  # the caller's generators are left alone
     with pytest.raises(ConfigError, match="a baseline keeps its last state only"):
-        api.evaluate(tmp_path / "run", checkpoint="best")
+        api.evaluate(zoo, checkpoint="best")
     with pytest.raises(ConfigError, match="is a baseline's run; only rmc evaluate"):
-        api.resume(tmp_path / "run")
+        api.resume(zoo)
 
 
 class StopOnce(StopSignal):
@@ -222,21 +242,17 @@ def test_the_zoos_discounts(algorithm, env, gamma):
     assert choose(algorithm, "zoo", env).arguments["gamma"] == gamma
 
 
-def test_updates_are_gradient_steps():
-    model = BaselineModel(config("ppo"), None)
-    model.sb3.learn(1)
-    assert model.updates == 10 * 2048 // 64
-
-
-def test_the_zoos_ppo_trains_and_keeps_its_scales(tmp_path):
+def test_the_zoos_ppo_trains_and_keeps_its_scales(zoo, tmp_path):
     """With running statistics of observations, which a run that goes on has again."""
-    settings = config("ppo", "zoo", env=EnvConfig("Hopper-v5"), total_steps=600, checkpoint_steps=300)
-    for total in (600, 1200):
-        assert run(dataclasses.replace(settings, total_steps=total), tmp_path / "run") == 0
-        (scales,) = (tmp_path / "run" / "checkpoints").glob("*/scales.pkl")
+    folder = Path(shutil.copytree(zoo, tmp_path / "run"))
+    assert run(dataclasses.replace(ZOO, total_steps=1200), folder) == 0
+    for path in (zoo, folder):
+        past = of_run(RunFolder(path))
+        (scales,) = (path / "checkpoints").glob("*/scales.pkl")
         with scales.open("rb") as file:
             count = pickle.load(file).obs_rms.count
-        assert count == pytest.approx(of_run(RunFolder(tmp_path / "run")).env_steps, rel=0.02)
+        assert count == pytest.approx(past.env_steps, rel=0.02)
+        assert past.updates == 5 * past.env_steps // 32  # gradient steps: 5 epochs, in batches of 32
 
 
 def test_one_in_use_is_left_as_it_is_and_can_be_stopped(tmp_path, capsys):
@@ -256,9 +272,8 @@ def test_one_in_use_is_left_as_it_is_and_can_be_stopped(tmp_path, capsys):
     assert (captured.out, captured.err) == (f"{tmp_path / 'run'} has ended\n", "")
 
 
-def test_files_that_are_cut_are_named(tmp_path):
-    folder = tmp_path / "run"
-    assert run(config(total_steps=100), folder) == 0
+def test_files_that_are_cut_are_named(finished, tmp_path):
+    folder = Path(shutil.copytree(finished, tmp_path / "run"))
     (state,) = (folder / "checkpoints").iterdir()
     cuts = {folder / "initial.json": "JSON", folder / "config.json": "JSON", state / "progress.json": "JSON"}
     cuts |= dict.fromkeys((state / "replay_buffer.pkl", state / "model.zip"), "cannot be read")
@@ -268,7 +283,7 @@ def test_files_that_are_cut_are_named(tmp_path):
             path.write_bytes(cut)
             if path.name != "progress.json":
                 with pytest.raises(ConfigError, match=rf"{folder}.*{fault}"):
-                    run(config(total_steps=200), folder)
+                    run(config(total_steps=300), folder)
             if path.name in ("progress.json", "model.zip", "config.json"):
                 with pytest.raises(ConfigError, match=rf"{folder}.*{fault}"):
                     evaluate(RunFolder(folder), 1, None, 0.0, lambda _: None)
@@ -291,11 +306,10 @@ def test_an_evaluation_that_was_stopped_is_made_up(tmp_path, monkeypatch):
     assert [one.env_steps for one in of_run(folder).evaluations] == [101, 200, 300]
 
 
-def test_it_is_played_with_the_time_limit_that_is_given(tmp_path, monkeypatch):
-    run(config(total_steps=100), tmp_path / "run")
+def test_it_is_played_with_the_time_limit_that_is_given(finished, monkeypatch):
     seconds, made = [], baselines.env_layout
     monkeypatch.setattr(baselines, "env_layout", lambda env: seconds.append(env.env_timeout) or made(env))
-    evaluate(RunFolder(tmp_path / "run"), 1, env_timeout=7.0)
+    evaluate(RunFolder(finished), 1, env_timeout=7.0)
     assert seconds == [7.0]
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 
 from rmc.analysis import host_faults, run_faults
 from rmc.analysis.bottleneck import bottleneck
@@ -15,10 +16,11 @@ from rmc.analysis.doctor import examine
 from rmc.analysis.vitals import Vitals
 from rmc.cli.main import run
 from rmc.common.env.config import EnvConfig
+from rmc.deploy.monitor.monitor import Monitor
 from rmc.deploy.run.config import RunConfig, to_json
-from rmc.deploy.run.presets import debug, robust
+from rmc.deploy.run.presets import robust
 from tests.command import rmc
-from tests.docs.running import ran
+from tests.runs import untrained
 
 CONFIG = robust(EnvConfig("HalfCheetah-v5"))
 Record = dict[str, Any]
@@ -363,12 +365,10 @@ def test_a_real_run_whose_evaluator_starves(tmp_path: Path) -> None:
     assert "evaluator starved: " in output
 
 
-def test_a_real_run_records_its_host(tmp_path: Path) -> None:
-    config = dataclasses.replace(debug(EnvConfig("InvertedPendulum-v5")), total_steps=600)
-    words = ["train", config.env.id, "--preset", "debug", "--total-steps", "600", "--launcher", "lockstep"]
-    ran(tmp_path, *words, "--run-dir", "run")
-    lines = map(json.loads, (tmp_path / "run" / "metrics.jsonl").read_text().splitlines())
-    last = [one for one in lines if one["role"] == "launcher"][-1]
+def test_a_run_records_its_host(tmp_path: Path) -> None:
+    folder = untrained(tmp_path / "run")
+    Monitor(folder, folder.config(), Console(quiet=True)).close()
+    (last,) = folder.records()
     assert 0 < last["host_available_bytes"] <= last["host_memory_bytes"]
     assert 1 <= last["host_cores"] <= last["host_cpus"]
     assert all(0.0 <= last[name] <= 1.0 for name in ("host_idle_share", "host_steal_share"))

@@ -1,6 +1,5 @@
 """Policies to and from a hub, in processes of their own: its library reads the environment when it is imported."""
 
-import importlib.util
 import json
 import os
 import subprocess
@@ -18,6 +17,7 @@ from rmc.cli import main
 from rmc.common.errors import ConfigError
 from tests.analysis.hub_stub import TOKEN, Hub
 from tests.command import complaint
+from tests.hiding import hide
 from tests.runs import AGENTS, make_run
 
 Call = Callable[..., subprocess.CompletedProcess[str]]
@@ -190,8 +190,7 @@ def test_without_the_extra_one_line_says_how_to_get_it(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
-    there = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "huggingface_hub" else there(name))
+    hide("huggingface_hub", monkeypatch)
     monkeypatch.setattr("rmc.common.extra.how_to_install", lambda extra: f"pip install 'rmc-rl[{extra}]'")
     for words in (["hub", "push", "run", "me/swings"], ["hub", "pull", "me/swings"]):
         assert "huggingface-hub is missing; pip install 'rmc-rl[hub]'" in complaint(words, capsys)

@@ -59,12 +59,12 @@ def test_a_memory_that_holds_its_input_shows_it_at_every_delay_and_one_that_does
 ) -> None:
     holds, forgets = (influence(built(gate), of_memory_env) for gate in (ASLEEP, AWAKE))
     assert holds[0].delays == forgets[0].delays == (1, 2, 3, 5, 7, 10, 15)  # of 16 steps
-    for one in (holds[0].h, holds[0].q, holds[0].action):
+    for one in holds[0].changes.values():
         assert (one > 0.02).all()
         assert one[-1] > 0.8 * one[0]
     for kept, gone in zip(holds, forgets, strict=True):
         assert kept.delays
-        for values in (gone.h, gone.q, gone.action):
+        for values in gone.changes.values():
             assert (values < 1e-4).all()
 
 

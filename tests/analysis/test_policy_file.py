@@ -346,19 +346,16 @@ def test_weights_that_are_not_finite_are_refused(file: Path, capsys: pytest.Capt
 def test_a_file_is_played_and_exported_as_its_run_is(
     file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    errors = []
+    errors, out = [], tmp_path / "again.safetensors"
     for source in (file, tmp_path / "run"):
         assert main.run(["evaluate", str(source), "--episodes", "2", "--json"]) == 0
         errors.append(json.loads(capsys.readouterr().out.splitlines()[-1]))
-        assert main.run(["export", str(source), "--out", str(tmp_path / f"{source.stem}.onnx")]) == 0
+        assert main.run(["export", str(source), "--out", str(out)]) == 0
+        assert out.read_bytes() == file.read_bytes()
     assert errors[0] == errors[1]
-    capsys.readouterr()
+    assert "Joints-v0 after 70 steps, not evaluated" in capsys.readouterr().out.replace("\n", "")
     assert "--checkpoint='7': " in complaint(["evaluate", str(file), "--checkpoint", "7"], capsys)
     assert "cannot be read" in complaint(["evaluate", str(tmp_path / "none.safetensors")], capsys)
-    out = tmp_path / "again.safetensors"
-    assert main.run(["export", str(file), "--out", str(out)]) == 0
-    assert out.read_bytes() == file.read_bytes()
-    assert "Joints-v0 after 70 steps, not evaluated" in capsys.readouterr().out.replace("\n", "")
 
 
 def test_a_resume_with_more_time_for_the_environment_reaches_older_checkpoints(tmp_path: Path) -> None:

@@ -15,11 +15,7 @@ from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
-
-RESULT = {
-    "env_steps": 1500, "updates": 336, "wall_s": 21.0, "eval_return_mean": 11.5, "eval_return_std": 0.5,
-    "eval_episodes": 10, "initial_return_mean": 5.0,
-}  # fmt: skip
+from tests.runs import RESULT
 
 
 def run_in(path: Path, status: int | None, scores: tuple[float, ...] = ()) -> RunFolder:

@@ -3,7 +3,6 @@
 import asyncio
 import dataclasses
 import http.client
-import importlib.util
 import json
 import os
 import selectors
@@ -35,15 +34,12 @@ from rmc.deploy.run.presets import debug
 from rmc.deploy.run.starts import note_start
 from tests.analysis.browser import opened
 from tests.command import COMMAND, complaint
-from tests.runs import untrained
+from tests.hiding import hide
+from tests.runs import RESULT, untrained
 from tests.waiting import wait_until
 
 PAGES, STREAM_SECONDS = 100, 4.0
 CONFIG = dataclasses.replace(debug(EnvConfig("InvertedPendulum-v5")), total_steps=2000)
-RESULT = {
-    "env_steps": 1500, "updates": 336, "wall_s": 21.0, "eval_return_mean": 11.5, "eval_return_std": 0.5,
-    "eval_episodes": 10, "initial_return_mean": 5.0,
-}  # fmt: skip
 Serve = Callable[..., tuple[str, psutil.Process]]
 
 
@@ -438,8 +434,7 @@ def test_what_it_cannot_do_is_one_line(
 
 
 def test_what_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    there = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "uvicorn" else there(name))
+    hide("uvicorn", monkeypatch)
     assert "uvicorn is missing; pip install -e '.[watch]'" in complaint(["watch", "nowhere"], capsys)
 
 

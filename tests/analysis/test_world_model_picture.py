@@ -18,16 +18,19 @@ from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig
-from rmc.deploy.run.presets import debug
 from tests.command import complaint
 from tests.hostile import hostile_state
 from tests.runs import AGENTS, run_of
 
 
-@pytest.fixture(params=["robust", "plain", "filling blanks"])
+@pytest.fixture
 def config(request: pytest.FixtureRequest) -> RunConfig:
-    run = debug(EnvConfig("Pendulum-v1", flicker=0.1, time_limit=40))
-    return RunConfig(env=run.env, preset="debug", agent=AGENTS[request.param])
+    """Of "robust", unless a test names others."""
+    env, agent = EnvConfig("Pendulum-v1", flicker=0.1, time_limit=40), AGENTS[getattr(request, "param", "robust")]
+    return RunConfig(env=env, preset="debug", agent=agent)
+
+
+of_three_agents = pytest.mark.parametrize("config", ["robust", "plain", "filling blanks"], indirect=True)
 
 
 @torch.no_grad()
@@ -50,6 +53,7 @@ def rolled_out(agent: Agent, episode: Episode, start: int, horizon: int) -> torc
     return frame[0, 0]
 
 
+@of_three_agents
 def test_rollouts_are_those_of_a_plain_loop(config: RunConfig, tmp_path: Path) -> None:
     folder = run_of(tmp_path / "run", config)
     agent = load_agent(folder, config, "latest")
@@ -70,6 +74,7 @@ def test_rollouts_are_those_of_a_plain_loop(config: RunConfig, tmp_path: Path) -
     np.testing.assert_allclose(insight.unexplained, error / change, rtol=1e-4)
 
 
+@of_three_agents
 def test_the_command_writes_a_picture_and_says_it_in_numbers(
     config: RunConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

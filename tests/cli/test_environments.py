@@ -16,14 +16,14 @@ from rmc.analysis.policy import load_policy
 from rmc.cli import main, parser, train_options
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
-from rmc.deploy.run.config import from_json, to_json
+from rmc.deploy.run.config import to_json
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
 from tests import habits
 from tests.command import complaint
-from tests.runs import AGENTS, make_run, untrained
+from tests.runs import AGENTS, make_run, read_config, untrained
 
 WANTS = "tests.habits:Wants-v0"
 SLIDE = "tests.habits:Slide-v0"
@@ -39,7 +39,7 @@ def test_keywords_go_from_the_command_line_into_config_json() -> None:
     config = command.config()
     assert config.env.env_kwargs == {"goal": 1.5, "size": 4, "name": "hall"}
     assert json.loads(to_json(config))["env"]["env_kwargs"] == config.env.env_kwargs
-    assert from_json(to_json(config)) == config
+    assert read_config(to_json(config)) == config
 
 
 def test_every_command_makes_the_environment_with_its_keywords(tmp_path: Path, capsys: Any) -> None:

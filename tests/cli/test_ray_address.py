@@ -18,7 +18,12 @@ from rmc.deploy.ray import head
 QUICK_SECONDS = 60.0
 HERE = get_node_ip_address()  # Ray takes no loopback
 TOKEN = "c0ffee"
-COMMANDS = (["list"], ["stop", "run"], ["train", "InvertedPendulum-v5", "--launcher", "ray"])
+COMMANDS = (
+    ["list"],
+    ["stop", "run"],
+    ["train", "InvertedPendulum-v5", "--launcher", "ray"],
+    ["sweep", "InvertedPendulum-v5", "--launcher", "ray"],
+)
 
 
 class Head(grpc.GenericRpcHandler):
@@ -78,7 +83,7 @@ def test_where_nothing_listens_it_is_said_at_once(
         said = refusal(capsys, *words, "--ray-address", address)
         assert said.startswith(f"rmc: --ray-address='{address}': no Ray cluster answers at ")
         assert "give the HOST:PORT" in said
-    assert not list(tmp_path.iterdir())
+    assert {path.name for path in tmp_path.rglob("*") if path.is_file()} <= {".lock", "sweep.jsonl"}  # no run is begun
 
 
 def test_auto_takes_an_address_at_which_nothing_is_any_more(

@@ -71,13 +71,13 @@ def test_the_last_evaluation_judges_and_does_not_choose(folder):
 
 def test_the_untrained_policy_is_played_once(folder, monkeypatch):
     """Its result is read at a resume; where that is damaged, it is played again."""
-    played, play = [], evaluation.evaluate_blob
+    played, play = [], evaluation.evaluate_policy
 
-    def counted(config, blob, *others):
-        played.append(blob)
-        return play(config, blob, *others)
+    def counted(policy, *others):
+        played.append(policy)
+        return play(policy, *others)
 
-    monkeypatch.setattr(evaluation, "evaluate_blob", counted)
+    monkeypatch.setattr(evaluation, "evaluate_policy", counted)
 
     def train() -> float:
         """How often a policy was played, with the last's; what the result says of the untrained one."""
@@ -123,17 +123,17 @@ def test_an_evaluation_without_end_shows_that_it_goes_on_and_is_cut(tmp_path, mo
 
 
 def test_in_lockstep_no_clock_cuts_an_evaluation_and_none_counts_as_training(folder, monkeypatch):
-    limits, begins, ends, play = [], [], [], evaluation.evaluate_blob
+    limits, begins, ends, play = [], [], [], evaluation.evaluate_policy
 
-    def noted(header, blob, episodes, flicker, seconds, *others):
+    def noted(policy, episodes, flicker, seconds, *others):
         limits.append(seconds)
         begins.append(time.monotonic())
         time.sleep(0.5)
-        played = play(header, blob, episodes, flicker, seconds, *others)
+        played = play(policy, episodes, flicker, seconds, *others)
         ends.append(time.monotonic())
         return played
 
-    monkeypatch.setattr(evaluation, "evaluate_blob", noted)
+    monkeypatch.setattr(evaluation, "evaluate_policy", noted)
     for launcher in ("lockstep", "local"):
         for file in (folder.initial_file, folder.result_file):
             file.unlink(missing_ok=True)

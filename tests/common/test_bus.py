@@ -2,11 +2,8 @@
 
 import itertools
 import os
-import shutil
-import tempfile
 import uuid
 from contextlib import nullcontext
-from pathlib import Path
 
 import pytest
 import redis
@@ -316,32 +313,28 @@ def test_the_memory_bus_forgets_old_records():
     assert METRICS_KEPT <= len(bus.records({"actor-0": "0"})[0]) < 2 * METRICS_KEPT
 
 
-def test_a_full_redis_is_emptied_by_commits():
-    folder = Path(tempfile.mkdtemp(prefix="rmc-full-"))  # short: a socket path may have 107 bytes
-    try:
-        with RedisServer(folder) as server:
-            bus = RedisBus(server.url(), "full")
-            bus.redis.config_set("maxmemory", 8 << 20)
-            owner, seq = ReplayOwner("replay", bus.take_epoch("replay")), fill(bus)
-            assert seq > 10
-            bus.commit(owner, {0: Ack(EntryId(1, seq - 1), 5)})
-            assert bus.ack(0) == Ack(EntryId(1, seq - 1), 5)
-            bus.append(0, EntryId(1, seq), b"and on it goes")
-            assert len(bus.read({0: EntryId(0, 0)}, 1000)) == 1
-            fill(bus, seq + 1)
-            bus.take_epoch("replay")
-            with pytest.raises(FencedError):
-                bus.commit(owner, {0: Ack(EntryId(1, seq), 5)})  # replaced, and nothing is trimmed
-            assert len(bus.read({0: EntryId(0, 0)}, 1000)) > 10
-            with pytest.raises(BusUnavailable, match="out of range"):
-                RedisBus(f"{server.url()}?db=99", "full").ping()
-    finally:
-        shutil.rmtree(folder)
+def test_a_full_redis_is_emptied_by_commits(short):
+    with RedisServer(short) as server:
+        bus = RedisBus(server.url(), "full")
+        bus.redis.config_set("maxmemory", 8 << 20)
+        owner, seq = ReplayOwner("replay", bus.take_epoch("replay")), fill(bus)
+        assert seq > 10
+        bus.commit(owner, {0: Ack(EntryId(1, seq - 1), 5)})
+        assert bus.ack(0) == Ack(EntryId(1, seq - 1), 5)
+        bus.append(0, EntryId(1, seq), b"and on it goes")
+        assert len(bus.read({0: EntryId(0, 0)}, 1000)) == 1
+        fill(bus, seq + 1)
+        bus.take_epoch("replay")
+        with pytest.raises(FencedError):
+            bus.commit(owner, {0: Ack(EntryId(1, seq), 5)})  # replaced, and nothing is trimmed
+        assert len(bus.read({0: EntryId(0, 0)}, 1000)) > 10
+        with pytest.raises(BusUnavailable, match="out of range"):
+            RedisBus(f"{server.url()}?db=99", "full").ping()
 
 
-def test_a_full_redis_trims_in_no_transaction_that_says_acks():
+def test_a_full_redis_trims_in_no_transaction_that_says_acks(short):
     """Or trimming would need no script, and no role the right to run one."""
-    with tempfile.TemporaryDirectory(prefix="rmc-full-") as folder, RedisServer(Path(folder)) as server:
+    with RedisServer(short) as server:
         bus = RedisBus(server.url(), "full")
         for seq in range(20):
             bus.append(0, EntryId(1, seq), b"x" * 200_000)

@@ -234,13 +234,12 @@ def test_an_epoch_that_none_can_be_is_mended(bus: RedisBus, value: str | int) ->
     assert bus.current_epoch("replay") == 1
 
 
-def test_a_cluster_is_waited_for_while_it_is_down() -> None:
-    with tempfile.TemporaryDirectory(prefix="rmc-cluster-") as folder:
-        words = ["--port", "0", "--unixsocket", f"{folder}/r", "--cluster-enabled", "yes", "--dir", folder]
-        with subprocess.Popen([server_binary(), *words], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as node:
-            try:
-                bus = connect(f"unix://{folder}/r", "run", Deadline(10.0, StopSignal()))
-                with pytest.raises(BusUnavailable, match="CLUSTERDOWN"):
-                    bus.set_config(b"{}")
-            finally:
-                node.kill()
+def test_a_cluster_is_waited_for_while_it_is_down(short: Path) -> None:
+    words = [server_binary(), "--port", "0", "--unixsocket", f"{short}/r", "--cluster-enabled", "yes", "--dir", short]
+    with subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as node:
+        try:
+            bus = connect(f"unix://{short}/r", "run", Deadline(10.0, StopSignal()))
+            with pytest.raises(BusUnavailable, match="CLUSTERDOWN"):
+                bus.set_config(b"{}")
+        finally:
+            node.kill()

@@ -9,6 +9,7 @@ from rmc.common.errors import MessageError
 from rmc.common.row_checksum import add_checksums
 from rmc.common.shared_batches import TURNS, SharedBatches, reserve_memory, shared_bytes
 from rmc.common.window import WindowSpec
+from tests.raising import raising
 
 SPEC = WindowSpec(obs_dim=3, action_dim=2, state=4, burn_in=2, train=4)
 BATCH = 8
@@ -24,10 +25,7 @@ def descriptor():
 
 
 def test_a_sandbox_that_refuses_such_memory_gets_none(monkeypatch):
-    def refuse(*_):
-        raise PermissionError(1, os.strerror(1))
-
-    monkeypatch.setattr(os, "memfd_create", refuse)
+    monkeypatch.setattr(os, "memfd_create", raising(PermissionError(1, os.strerror(1))))
     assert reserve_memory(4096) is None
 
 

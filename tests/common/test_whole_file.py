@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from rmc.common.whole_file import write_private
+from tests.raising import raising
 
 
 def test_a_private_file_takes_the_place_of_one_that_others_may_read(tmp_path: Path) -> None:
@@ -20,12 +21,9 @@ def test_a_private_file_takes_the_place_of_one_that_others_may_read(tmp_path: Pa
 
 
 def test_a_private_file_without_room_leaves_the_one_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(_: int) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
     path = tmp_path / "secret"
     write_private(path, b"before")
-    monkeypatch.setattr(os, "fsync", full)
+    monkeypatch.setattr(os, "fsync", raising(OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))))
     with pytest.raises(OSError, match="No space left"):
         write_private(path, b"after")
     assert path.read_bytes() == b"before"

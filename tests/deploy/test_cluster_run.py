@@ -24,6 +24,7 @@ from rmc.deploy.ray.placement import RolePlacement
 from rmc.deploy.ray.role_actor import RoleActor
 from rmc.deploy.ray.run import ClusterRun
 from rmc.deploy.run.folder import RunFolder
+from tests.raising import raising
 from tests.runs import untrained
 
 
@@ -103,10 +104,7 @@ def test_a_port_that_a_run_has_is_not_written_again(folder: RunFolder, monkeypat
     """A full disk would end a launcher that Ray has started again."""
     port, _ = ray_run._port(folder, "127.0.0.1")
 
-    def full(*_: object) -> None:
-        raise OSError(28, os.strerror(28))
-
-    monkeypatch.setattr(ray_run, "write_whole", full)
+    monkeypatch.setattr(ray_run, "write_whole", raising(OSError(28, os.strerror(28))))
     assert ray_run._port(folder, "127.0.0.1") == (port, False)
 
 
@@ -241,10 +239,7 @@ def test_an_actor_that_makes_room_ends_with_what_its_environments_started(
 
 
 def test_sigterm_while_ray_is_joined_stops_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    def init(**_: object) -> None:
-        raise SystemExit(15)
-
-    monkeypatch.setattr(ray_launcher.ray, "init", init)
+    monkeypatch.setattr(ray_launcher.ray, "init", raising(SystemExit(15)))
     with pytest.raises(KeyboardInterrupt), ray_launcher.joined("local"):
         pass
 

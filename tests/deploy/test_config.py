@@ -12,10 +12,11 @@ from hypothesis import strategies as st
 from rmc.common.agent_config import HeadInput
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
-from rmc.deploy.run.config import Preset, RunConfig, from_json, to_json
+from rmc.deploy.run.config import Preset, RunConfig, to_json
 from rmc.deploy.run.option_names import flat, option
 from rmc.deploy.run.presets import debug, memory, paper, preset_config, robust
 from rmc.deploy.run.validation import validate, validate_new
+from tests.runs import read_config
 
 ENV = EnvConfig("InvertedPendulum-v5")
 NAMES: list[Preset] = ["robust", "memory", "paper", "debug"]
@@ -26,7 +27,7 @@ def test_presets_are_valid_and_come_back_from_json(name: Preset) -> None:
     config = preset_config(name, ENV)
     validate(config)
     assert config.preset == name
-    assert from_json(to_json(config)) == config
+    assert read_config(to_json(config)) == config
 
 
 def test_the_paper_preset_is_the_papers() -> None:
@@ -61,7 +62,7 @@ def test_json_keeps_every_value(rate: float, steps: int, head_input: Any, target
         agent=dataclasses.replace(config.agent, head_input=head_input, heads=(7, 5)),
         update=dataclasses.replace(config.update, learning_rate=rate, target_memory=target),
     )
-    assert from_json(to_json(config)) == config
+    assert read_config(to_json(config)) == config
 
 
 @pytest.mark.parametrize(
@@ -84,7 +85,7 @@ def test_strange_json_is_refused(path: str, value: Any, message: str) -> None:
     parent, _, name = path.rpartition(".")
     (raw[parent] if parent else raw)[name] = value
     with pytest.raises(ConfigError, match=message) as caught:
-        from_json(json.dumps(raw))
+        read_config(json.dumps(raw))
     assert path.split(".")[0] in str(caught.value)
 
 
@@ -92,9 +93,9 @@ def test_missing_values_and_broken_files_are_refused() -> None:
     raw = json.loads(to_json(robust(ENV)))
     del raw["replay"]["capacity"]
     with pytest.raises(ConfigError, match=r"replay\.capacity"):
-        from_json(json.dumps(raw))
+        read_config(json.dumps(raw))
     with pytest.raises(ConfigError, match="not JSON"):
-        from_json(b"{")
+        read_config(b"{")
 
 
 def numeric_paths() -> list[str]:
@@ -110,9 +111,10 @@ def with_value(config: RunConfig, path: str, value: Any) -> RunConfig:
     return dataclasses.replace(config, **{parent: part})
 
 
-@pytest.mark.parametrize("value", [-1_000, math.nan, math.inf])
+@pytest.mark.parametrize("value", [-1, math.nan, math.inf])
 @pytest.mark.parametrize("path", numeric_paths())
 def test_every_number_is_judged(path: str, value: float) -> None:
+    value *= 101 if path == "update.target_entropy" else 1  # which may be negative
     with pytest.raises(ConfigError) as caught:
         validate(with_value(robust(ENV), path, value))
     assert path.rpartition(".")[2].replace("_", "-") in str(caught.value)
@@ -182,12 +184,8 @@ def test_the_longest_window_that_is_named_is_taken_and_no_longer_one(strategy: s
 
 @pytest.mark.parametrize(
     ("path", "value"),
-    [
-        ("replay.capacity", 0), ("replay.replay_ratio", 0.0), ("replay.replay_ratio", float("nan")),
-        ("replay.warmup_steps", -1), ("replay.priority_exponent", -0.1), ("actor.stride", -1),
-        ("actor.envs_per_actor", 0), ("actor.chunk_windows", 0),
-    ],
-)  # fmt: skip
+    [("replay.capacity", 0), ("replay.replay_ratio", 0.0), ("actor.envs_per_actor", 0), ("actor.chunk_windows", 0)],
+)
 def test_a_number_out_of_range_is_named(path: str, value: float) -> None:
     with pytest.raises(ConfigError, match=option(path)):
         validate(with_value(debug(EnvConfig("Pendulum-v1")), path, value))

@@ -25,6 +25,7 @@ from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.starts import note_start
 from tests.integration.running import free_port
+from tests.raising import raising
 
 ROOT = Path(__file__).parents[2]
 ALERTS = ROOT / "deploy" / "monitor" / "alerts.yaml"
@@ -130,12 +131,9 @@ def test_strangers_take_few_handles_and_the_end_waits_for_none(
 def test_where_no_thread_can_be_started_later_looks_are_answered(
     status: RunStatus, port: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(_: threading.Thread) -> None:
-        raise RuntimeError("can't start new thread")
-
     with exporter.served(status, "first", LaunchOptions(None, metrics_port=port)):
         with monkeypatch.context() as patch:
-            patch.setattr(threading.Thread, "start", full)
+            patch.setattr(threading.Thread, "start", raising(RuntimeError("can't start new thread")))
             for _ in range(2 * exporter.MOST_CLIENTS):
                 with socket.create_connection((HERE, port), timeout=10) as client:
                     assert client.recv(1) == b""

@@ -8,7 +8,7 @@ import resource
 import shutil
 import stat
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -35,6 +35,7 @@ from rmc.deploy.run.opening import make, open_run
 from rmc.deploy.run.presets import debug
 from rmc.deploy.run.state import run_state
 from tests.command import complaint
+from tests.raising import raising
 from tests.runs import untrained
 
 
@@ -82,11 +83,8 @@ def test_a_full_disk_keeps_no_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert text.startswith("training ")
     assert str(os.getpid()) in text
 
-    def full(*_: object) -> None:
-        raise OSError(28, os.strerror(28))
-
     with monkeypatch.context() as patch:
-        patch.setattr(os, "pwrite", full)
+        patch.setattr(os, "pwrite", raising(OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))))
         folder.lock.release(130)
         with pytest.raises(OSError, match="No space"):
             folder.lock.take()
@@ -136,7 +134,7 @@ def test_a_secret_is_made_once_on_a_disk_without_hard_links_too(
     fault: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if fault is not None:
-        monkeypatch.setattr(os, "link", raising(fault))
+        monkeypatch.setattr(os, "link", raising(OSError(fault, os.strerror(fault))))
     secret = RunFolder(tmp_path).secret()
     assert len(bytes.fromhex(secret.decode())) == 32
     assert RunFolder(tmp_path).secret() == secret
@@ -148,7 +146,7 @@ def test_a_secret_is_made_once_on_a_disk_without_hard_links_too(
 def test_a_disk_without_locks_is_one_line_before_there_is_a_run(
     fault: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fcntl.flock", raising(fault))
+    monkeypatch.setattr("fcntl.flock", raising(OSError(fault, os.strerror(fault))))
     with pytest.raises(ConfigError, match=r"^lock='.*/run/.lock': its disk locks no files \(.+\); take a folder on an"):
         open_run(debug(EnvConfig("InvertedPendulum-v5")), LaunchOptions(tmp_path / "run", "fail"))
     assert not (tmp_path / "run" / "config.json").exists()
@@ -159,7 +157,7 @@ def test_a_run_that_cannot_be_written_is_to_be_copied(
     fault: int, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = untrained(tmp_path / "run", debug(EnvConfig("Pendulum-v1")))
-    monkeypatch.setattr("rmc.deploy.run.run_lock.take_lock", raising(fault))
+    monkeypatch.setattr("rmc.deploy.run.run_lock.take_lock", raising(OSError(fault, os.strerror(fault))))
     line = (
         f"rmc: RUN='{run.path}': cannot be written ({os.strerror(fault)}); copy the run elsewhere, or make it writable"
     )
@@ -173,7 +171,7 @@ def test_a_copy_on_a_disk_without_locks_can_be_read(
     folder = open_run(debug(EnvConfig("InvertedPendulum-v5")), LaunchOptions(tmp_path / "run", "fail"))
     shutil.copytree(folder.path, tmp_path / "copy")
     folder.lock.release()
-    monkeypatch.setattr("fcntl.flock", raising(fault))
+    monkeypatch.setattr("fcntl.flock", raising(OSError(fault, os.strerror(fault))))
     assert run_state(RunFolder(tmp_path / "copy")) == "lost"
 
 
@@ -190,15 +188,6 @@ def test_a_folder_of_another_owner_that_can_be_written_is_taken(tmp_path: Path) 
         folder.secret()
     assert folder.secret_file.stat().st_uid == folder.checkpoints.stat().st_uid == 65534
     assert stat.S_IMODE(folder.secret_file.stat().st_mode) == 0o600
-
-
-def raising(fault: int) -> Callable[..., None]:
-    """What a call does on a disk that has not what it asks for."""
-
-    def call(*_: object, **__: object) -> None:
-        raise OSError(fault, os.strerror(fault))
-
-    return call
 
 
 @pytest.mark.parametrize("left", ["", "\n", "ab" * 31 + "\n"])
@@ -232,10 +221,7 @@ def test_a_start_that_fails_takes_no_result_along(folder: RunFolder, monkeypatch
     config = folder.config()
     folder.write_result(dict.fromkeys(RESULT, config.total_steps))
 
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, "no room")
-
-    monkeypatch.setattr("rmc.deploy.run.opening.note_start", full)
+    monkeypatch.setattr("rmc.deploy.run.opening.note_start", raising(OSError(errno.ENOSPC, "no room")))
     with pytest.raises(OSError, match="no room"):
         open_run(dataclasses.replace(config, total_steps=config.total_steps + 1), LaunchOptions(folder.path))
     assert folder.result() is not None

@@ -1,7 +1,6 @@
 """The learner's process, past its last step."""
 
 import signal
-import tempfile
 import threading
 import time
 from collections.abc import Iterator
@@ -24,9 +23,9 @@ from rmc.deploy.run.presets import debug
 
 
 @pytest.fixture
-def server() -> Iterator[RedisServer]:
-    """A Redis of its own, in a short folder."""
-    with tempfile.TemporaryDirectory() as folder, RedisServer(Path(folder)) as redis_server:
+def server(short: Path) -> Iterator[RedisServer]:
+    """A Redis of its own."""
+    with RedisServer(short) as redis_server:
         yield redis_server
 
 

@@ -79,7 +79,7 @@ def test_a_view_that_cannot_be_written_ends_nothing() -> None:
     status = RunStatus("Pendulum-v1", "debug", 0, 100, 4.0)
     with open("/dev/full", "wb", buffering=0) as raw:
         full = io.TextIOWrapper(raw, write_through=True)
-        View(status, Console(file=unfailing(full), force_terminal=False)).refresh()
+        View(status, Console(file=unfailing(full), force_terminal=False)).close()
         with pytest.raises(OSError, match="No space"):
             full.write("x")
 

@@ -4,7 +4,6 @@ import io
 import json
 import math
 import random
-import tempfile
 import time
 from collections.abc import Mapping
 from contextlib import suppress
@@ -39,6 +38,7 @@ from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.metrics_tail import wall_seconds
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
+from tests.raising import raising
 from tests.runs import untrained
 from tests.waiting import wait_until
 
@@ -307,11 +307,8 @@ def test_evaluations_that_found_no_room_are_marked_when_there_is_some(
 ) -> None:
     marked: list[tuple[int, float]] = []
 
-    def full(number: int, score: float) -> None:
-        raise OSError(28, "No space left on device")
-
     for update, score in ((10, 1.0), (20, 3.0), (30, 2.0)):
-        monkeypatch.setattr(monitor._checkpoints, "mark_best", full)
+        monkeypatch.setattr(monitor._checkpoints, "mark_best", raising(OSError(28, "No space left on device")))
         monitor.take({"role": "evaluator", "eval_update": update, "eval_return_mean": score})
     monkeypatch.setattr(monitor._checkpoints, "mark_best", lambda *arguments: marked.append(arguments) or True)
     for _ in range(2):
@@ -428,14 +425,14 @@ def test_many_that_are_silent_are_counted(monitor: Monitor) -> None:
 
 
 def test_a_redis_that_stands_still_is_said_while_it_lasts_and_frames_go_on(
-    config: RunConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    config: RunConfig, short: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(redis_connection, "TIMEOUT_SECONDS", 1.0)
     monkeypatch.setattr(view, "LINE_SECONDS", 0.1)
     monkeypatch.setattr(view, "REFRESH_SECONDS", 0.05)
     folder, printed = open_run(config, LaunchOptions(tmp_path / "run", "fail")), io.StringIO()
     folder.lock.release()
-    with tempfile.TemporaryDirectory() as short, RedisServer(Path(short)) as server:
+    with RedisServer(short) as server:
         bus, monitor = RedisBus(server.url(), "run"), Monitor(folder, config, Console(file=printed, width=500))
         assert server.process is not None
         for role in config.roles():

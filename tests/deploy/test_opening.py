@@ -20,6 +20,7 @@ from rmc.deploy.run.presets import debug
 from rmc.deploy.run.starts import format_starts, last_launch, starts
 from rmc.deploy.run.state import run_state
 from tests.deploy.test_config import with_value
+from tests.raising import raising
 
 CONFIG = debug(EnvConfig("InvertedPendulum-v5"))
 FINISHED = dict.fromkeys(RESULT, 4_000) | {"eval_cut": 0.0}
@@ -129,11 +130,8 @@ def test_a_start_that_is_refused_leaves_how_the_last_one_ended(folder: RunFolder
     folder.lock.take()
     folder.lock.release(status)
 
-    def refuse(_: RunFolder) -> None:
-        raise ConfigError("--run-dir", "", "is being trained")
-
     with pytest.raises(ConfigError, match="is being trained"):
-        open_run(CONFIG, LaunchOptions(folder.path), check=refuse)
+        open_run(CONFIG, LaunchOptions(folder.path), check=raising(ConfigError("--run-dir", "", "is being trained")))
     assert run_state(folder) == state
     assert folder.lock.ended() == status
 

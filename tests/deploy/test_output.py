@@ -5,7 +5,6 @@ import os
 import pty
 import subprocess
 import sys
-import time
 from contextlib import suppress
 from pathlib import Path
 
@@ -34,9 +33,7 @@ def test_a_reader_that_is_gone_ends_nothing(log: Path, monkeypatch: pytest.Monke
         os.close(reading)
         console.print("kept")
         assert log.read_text() == "kept\n"
-        view = View(RunStatus("Env-v0", "debug", 0, 10, 1.0), console)
-        view.refresh()
-        view.close()
+        View(RunStatus("Env-v0", "debug", 0, 10, 1.0), console).close()
     assert log.read_text() == "kept\n"
 
 
@@ -47,10 +44,8 @@ def test_a_live_view_outlives_its_terminal(log: Path, monkeypatch: pytest.Monkey
         monkeypatch.setenv("TERM", "xterm")
         console = terminal()
         view = View(RunStatus("Env-v0", "debug", 0, 10, 1.0), console)
-        view.refresh()
         os.close(ours)
-        time.sleep(0.6)
-        view.refresh()
+        view._show()
         view.close()
         console.print("kept")
     assert log.read_text().endswith("kept\n")

@@ -67,8 +67,8 @@ def test_an_empty_redis_does_not_take_the_copy_away(tmp_path: Path) -> None:
 def test_a_damaged_copy_is_told_and_the_run_goes_on(
     tmp_path: Path, content: bytes, caplog: pytest.LogCaptureFixture
 ) -> None:
-    counters, bus = ProgressBackup(RunFolder(tmp_path), shards=1), MemoryBus()
     (tmp_path / "replay-counters").write_bytes(content)
+    counters, bus = ProgressBackup(RunFolder(tmp_path), shards=1), MemoryBus()
     counters.restore(bus)
     assert bus.progress("replay") is None
     assert [record.getMessage().count("replay-counters: cannot be read") for record in caplog.records] == [1]

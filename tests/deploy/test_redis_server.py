@@ -15,6 +15,7 @@ from rmc.common.errors import ConfigError
 from rmc.deploy.redis.server import MAX_VALUE, Port, RedisServer, server_binary
 from rmc.deploy.redis.users import RedisUsers
 from tests.processes import alive
+from tests.raising import raising
 from tests.waiting import wait_until
 
 HOLDER = """
@@ -100,11 +101,7 @@ def test_one_that_cannot_be_started_again_now_is_tried_again(
         server.process.kill()
         server.process.wait()
         with monkeypatch.context() as patched:
-
-            def no_memory(*_: object, **__: object) -> None:
-                raise OSError(12, "Cannot allocate memory")
-
-            patched.setattr(subprocess, "Popen", no_memory)
+            patched.setattr(subprocess, "Popen", raising(OSError(12, "Cannot allocate memory")))
             server.tend()
             server.tend()
         assert sum("trying again" in message for message in caplog.messages) == 2

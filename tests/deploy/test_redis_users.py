@@ -145,8 +145,8 @@ FORBIDDEN_TO_SHARDS = """
 """
 
 
-def test_shards_have_their_own_actors_streams() -> None:
-    with tempfile.TemporaryDirectory(prefix="rmc-users-") as folder, RedisServer(Path(folder), users=SHARDED) as server:
+def test_shards_have_their_own_actors_streams(short: Path) -> None:
+    with RedisServer(short, users=SHARDED) as server:
         for own, other in ((0, 1), (1, 0)):
             bus = RedisBus(server.url(f"replay-{own}"), USERS.run)
             owner = ReplayOwner(f"replay-{own}", bus.take_epoch(f"replay-{own}"))
@@ -201,8 +201,8 @@ def test_a_stranger_is_told_so_in_one_line_that_holds_no_password(server: RedisS
     assert USERS.password("actor-1") not in str(error.value)
 
 
-def test_users_that_come_later_get_in(tmp_path: Path) -> None:
-    with tempfile.TemporaryDirectory(prefix="rmc-users-") as folder, RedisServer(Path(folder), users=USERS) as server:
+def test_users_that_come_later_get_in(short: Path) -> None:
+    with RedisServer(short, users=USERS) as server:
         held = bus_of(server, "actor-1")
         held.ping()
         more = RedisUsers(USERS.run, SECRET, (*USERS.roles, "actor-2"))
@@ -213,8 +213,8 @@ def test_users_that_come_later_get_in(tmp_path: Path) -> None:
         held.append(1, EntryId(1, 0), b"hello")
 
 
-def test_users_that_come_while_the_server_stands_still_get_in_later(tmp_path: Path) -> None:
-    with tempfile.TemporaryDirectory(prefix="rmc-users-") as folder, RedisServer(Path(folder), users=USERS) as server:
+def test_users_that_come_while_the_server_stands_still_get_in_later(short: Path) -> None:
+    with RedisServer(short, users=USERS) as server:
         assert server.process is not None
         server.process.send_signal(signal.SIGSTOP)
         more = RedisUsers(USERS.run, SECRET, (*USERS.roles, "actor-2"))
@@ -227,12 +227,12 @@ def test_users_that_come_while_the_server_stands_still_get_in_later(tmp_path: Pa
         late.redis.close()
 
 
-def test_where_there_is_no_room_for_other_users_those_before_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_there_is_no_room_for_other_users_those_before_stay(short: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(path: Path, _: bytes) -> None:
         path.write_bytes(b"")
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    with tempfile.TemporaryDirectory(prefix="rmc-users-") as folder, RedisServer(Path(folder), users=USERS) as server:
+    with RedisServer(short, users=USERS) as server:
         with monkeypatch.context() as patch:
             patch.setattr(whole_file, "write_synced", full)
             with pytest.raises(OSError, match="No space"):
@@ -243,16 +243,16 @@ def test_where_there_is_no_room_for_other_users_those_before_stay(monkeypatch: p
         there.redis.close()
 
 
-def test_passwords_are_nowhere_to_be_read(tmp_path: Path) -> None:
+def test_passwords_are_nowhere_to_be_read(short: Path) -> None:
     """Neither on a command line nor in the server's files or a value's repr; files are the owner's alone."""
     with socket.create_server(("127.0.0.1", 0)) as probe:
         number = int(probe.getsockname()[1])
     port = Port("127.0.0.1", number)
-    with tempfile.TemporaryDirectory() as name, RedisServer(folder := Path(name), port=port, users=USERS) as server:
+    with RedisServer(short, port=port, users=USERS) as server:
         RedisBus(server.network_url("actor-0"), USERS.run).ping()
         assert server.process is not None
         visible = Path(f"/proc/{server.process.pid}/cmdline").read_text() + repr(USERS)
-        visible += "".join(file.read_text() for file in folder.iterdir() if not file.is_socket())
-        assert stat.S_IMODE((folder / "users.acl").stat().st_mode) == 0o600
+        visible += "".join(file.read_text() for file in short.iterdir() if not file.is_socket())
+        assert stat.S_IMODE((short / "users.acl").stat().st_mode) == 0o600
         assert not [user for user in ROLES if USERS.password(user) in visible]
         assert SECRET.decode() not in visible

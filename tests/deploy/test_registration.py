@@ -29,6 +29,7 @@ from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.presets import debug
 from rmc.replay_server.commit_record import Progress
 from tests import habits
+from tests.raising import raising
 from tests.replay_server.support import SPEC
 
 CONFIG = debug(EnvConfig("Pendulum-v1"))
@@ -130,13 +131,10 @@ def test_a_run_started_by_hand_is_told_to_stop_once_redis_takes_it(
 def test_a_run_started_by_hand_whose_launcher_fails_is_stopped_and_leaves_nothing_in_redis(
     tmp_path: Path, redis_url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def moved(_: object) -> None:
-        raise ConfigError("--run-dir", "", "was deleted or moved")
-
     folder = RunFolder(tmp_path)
     folder.write_config(CONFIG)
     bus, monitor = RedisBus(redis_url, folder.name), Monitor(folder, CONFIG, Console(quiet=True))
-    monkeypatch.setattr(monitor, "watch", moved)
+    monkeypatch.setattr(monitor, "watch", raising(ConfigError("--run-dir", "", "was deleted or moved")))
     with pytest.raises(ConfigError, match="was deleted or moved"):
         launcher.attend(CONFIG, folder, redis_url, monitor, StopSignal())
     assert bus.stop_requested() == "stopped by its launcher"
@@ -178,11 +176,8 @@ def test_a_redis_that_is_away_is_told_later(
     registered = Registration(CONFIG, RunFolder(tmp_path), bus)
     _forget(redis_url, run_name)
 
-    def away(_: bytes) -> None:
-        raise BusUnavailable("gone again")
-
     with monkeypatch.context() as patched:
-        patched.setattr(bus, "set_config", away)
+        patched.setattr(bus, "set_config", raising(BusUnavailable("gone again")))
         registered.tend()
     assert bus.config() is None
     registered.tend()

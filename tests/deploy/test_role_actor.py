@@ -26,6 +26,7 @@ from rmc.deploy.ray.launcher_actor import LauncherActor
 from rmc.deploy.ray.learner_actor import LearnerActor
 from rmc.deploy.ray.role_actor import RoleActor, Task
 from tests.processes import alive
+from tests.raising import raising
 from tests.waiting import wait_until
 
 PYTHON = sys.executable
@@ -74,7 +75,7 @@ def host(program: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iter
         return ended
 
     monkeypatch.setattr(supervisor.RoleProcess, "reap", slow_for_watchers)
-    actor = RoleActor(Task("test-run", "test-run", RoleCommand("replay", ("replay",)), {}, {}, str(tmp_path)))
+    actor = RoleActor(Task("test-run", RoleCommand("replay", ("replay",)), {}, {}, str(tmp_path)))
     yield actor
     actor.close()
     actor.clear()
@@ -97,9 +98,7 @@ def test_a_role_that_is_replaced_does_not_end_its_host(host: RoleActor, ends: li
 def test_a_role_that_is_replaced_has_its_secrets_again(program: Path, tmp_path: Path) -> None:
     """Though a cleaner of temporary files has taken them."""
     assert program.exists()
-    actor = RoleActor(
-        Task("run", "run", RoleCommand("replay", ("replay",)), {}, {"secret": b"of the run"}, str(tmp_path))
-    )
+    actor = RoleActor(Task("run", RoleCommand("replay", ("replay",)), {}, {"secret": b"of the run"}, str(tmp_path)))
     (actor.scratch / "secret").unlink()
     actor.restart()
     assert (actor.scratch / "secret").read_text() == "of the run"
@@ -113,7 +112,7 @@ from rmc.deploy.local.role_command import RoleCommand
 from rmc.deploy.ray.role_actor import RoleActor, Task
 print(subprocess.Popen(["sleep", "60"], stdout=subprocess.DEVNULL).pid, flush=True)
 sys.executable = sys.argv[1]
-host = RoleActor(Task("run", "run", RoleCommand("actor-0", ("actor",)), {}, {}, "."))
+host = RoleActor(Task("run", RoleCommand("actor-0", ("actor",)), {}, {}, "."))
 time.sleep(60)
 """
 STRAYS = """#!/bin/sh
@@ -145,10 +144,7 @@ def test_what_an_environment_started_ends_with_a_role_that_is_killed(program: Pa
 def test_a_host_that_can_start_no_process_ends_itself(
     error: Exception, host: RoleActor, ends: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def start() -> None:
-        raise error
-
-    monkeypatch.setattr(host._role, "start", start)
+    monkeypatch.setattr(host._role, "start", raising(error))
     host.restart()
     assert ends == [1]
 
@@ -190,7 +186,7 @@ def test_a_learner_that_saves_for_long_is_not_killed(
     ends = ENDS.replace("exit 0", f"sleep 1.5; echo saved >> {log}; exit 0")
     program.write_text(ends.replace("while", f"echo ready > {log}\nwhile"))
     monkeypatch.setattr(learner_actor, "HELD_SECONDS", 0.5)
-    host = Learner(Task("test-run", "test-run", RoleCommand("learner", ("learner",)), {}, {}, str(tmp_path)))
+    host = Learner(Task("test-run", RoleCommand("learner", ("learner",)), {}, {}, str(tmp_path)))
     wait_until(log.exists)
     host.close()
     host.clear()
@@ -199,7 +195,7 @@ def test_a_learner_that_saves_for_long_is_not_killed(
 
 def test_a_damaged_checkpoint_holds_no_newer_one_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     learner, brought = LearnerActor.__new__(LearnerActor), list[int]()
-    learner._folder, learner._archived, learner._epoch, learner._incarnation = CheckpointFolder(tmp_path), set(), 0, ""
+    learner._folder, learner._archived, learner._epoch, learner._incarnation = CheckpointFolder(tmp_path), -1, 0, ""
     for number in (1, 2):
         learner._folder.save(number, {"state": b"whole"})
     (learner._folder.path(1) / "state").write_bytes(b"whale")
@@ -218,14 +214,11 @@ def test_a_damaged_checkpoint_holds_no_newer_one_back(tmp_path: Path, monkeypatc
 def test_a_launchers_host_that_can_start_no_process_is_tried_again_where_ray_has_started_it_again(
     again: bool, statuses: list[int], ends: list[int], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    def begin(*_: object) -> None:
-        raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN))
-
-    monkeypatch.setattr(RoleActor, "__init__", begin)
+    monkeypatch.setattr(RoleActor, "__init__", raising(OSError(errno.EAGAIN, os.strerror(errno.EAGAIN))))
     context = SimpleNamespace(was_current_actor_reconstructed=again)
     monkeypatch.setattr(launcher_actor.ray, "get_runtime_context", lambda: context)
     with pytest.raises(BlockingIOError):  # its creator hears of it
-        LauncherActor(Task("r", "r", RoleCommand("launcher", ()), {}, {}, ""), str(tmp_path), 1)
+        LauncherActor(Task("r", RoleCommand("launcher", ()), {}, {}, ""), str(tmp_path), 1)
     assert ends == statuses
 
 
@@ -237,7 +230,7 @@ def test_a_learners_own_checkpoints_outlive_a_start_of_ray_on_its_machine(
     head = LauncherActor.__new__(LauncherActor)
     head._claim, head._checkpoints = tmp_path / "learner-at", CheckpointFolder(tmp_path / "head")
     head.claim("before", "10.0.0.2" if was_here else "10.0.0.3")
-    learner, asks = LearnerActor.__new__(LearnerActor), ("claim", "newest", "numbers", "last_epoch")
+    learner, asks = LearnerActor.__new__(LearnerActor), ("claim", "newest")
     learner.scratch, learner._incarnation = tmp_path, "now"
     CheckpointFolder(tmp_path / "checkpoints").save(7, {"state": b"whole"})
     remote = SimpleNamespace(**{name: SimpleNamespace(remote=getattr(head, name)) for name in asks})
@@ -255,7 +248,7 @@ def test_an_end_in_order_that_nobody_asked_for_is_a_death(
     program: Path, ends: list[int], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     program.write_text("#!/bin/sh\nexit 0\n")
-    host = RoleActor(Task("test-run", "test-run", RoleCommand("actor-0", ("actor",)), {}, {}, str(tmp_path)))
+    host = RoleActor(Task("test-run", RoleCommand("actor-0", ("actor",)), {}, {}, str(tmp_path)))
     wait_until(lambda: ends)
     assert host.report("", 0).status == 1
     host.clear()
@@ -280,7 +273,7 @@ def test_what_a_launcher_leaves_is_ended_but_no_other_runs(monkeypatch: pytest.M
     monkeypatch.setattr(ray, "kill", lambda host, **_: done.append(kill.get(id(host), f"kill {host}")))
     launcher = LauncherActor.__new__(LauncherActor)
     launcher._task, launcher._checkpoints = (
-        Task("r", "r", RoleCommand("launcher", ()), {}, {}, ""),
+        Task("r", RoleCommand("launcher", ()), {}, {}, ""),
         CheckpointFolder(tmp_path),
     )
     launcher.flush_artifacts()

@@ -4,9 +4,7 @@ import os
 import signal
 import subprocess
 import sys
-import tempfile
 import time
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -28,14 +26,8 @@ from rmc.deploy.redis.server import RedisServer
 from rmc.deploy.redis.users import RedisUsers
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.presets import debug
+from tests.raising import raising
 from tests.waiting import wait_until
-
-
-@pytest.fixture
-def short() -> Iterator[Path]:
-    """A folder; pytest's own are too long for a socket's path."""
-    with tempfile.TemporaryDirectory() as folder:
-        yield Path(folder)
 
 
 def test_a_role_waits_for_a_redis_that_is_coming_back(short: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -180,11 +172,8 @@ def test_a_replay_server_begins_though_its_actors_windows_fill_redis(
 def test_one_that_answers_that_it_is_full_is_there(short: Path) -> None:
     with RedisServer(short) as server:
         bus = RedisBus(server.url(), "run")
-
-        def full(*words: object) -> None:
-            raise redis.exceptions.ResponseError("MISCONF Errors writing to the AOF file: No space left on device")
-
-        bus.redis.ping = full
+        full = "MISCONF Errors writing to the AOF file: No space left on device"
+        bus.redis.ping = raising(redis.exceptions.ResponseError(full))
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("rmc.deploy.redis.connect.RedisBus", lambda url, run: bus)
             assert connect(server.url(), "run") is bus

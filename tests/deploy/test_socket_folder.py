@@ -16,6 +16,7 @@ from rmc.common.errors import ConfigError, RoleDied
 from rmc.deploy.redis import socket_folder
 from rmc.deploy.redis.server import SOCKET_PATH_LIMIT, RedisServer
 from rmc.deploy.redis.socket_folder import LONGEST_NAME, SocketFolder, place_for_sockets, sweep
+from tests.raising import raising
 
 ODD = "a#b?c%d e\"f\\g'h+ü&@*[i]"
 HOLDER = """
@@ -150,10 +151,7 @@ def test_one_that_others_removed_is_made_again_and_locked(temporary: Path) -> No
 
 
 def test_so_is_one_on_a_disk_that_locks_no_folders(temporary: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object) -> None:
-        raise OSError(errno.EBADF, os.strerror(errno.EBADF))
-
-    monkeypatch.setattr(socket_folder, "try_lock", refuse)
+    monkeypatch.setattr(socket_folder, "try_lock", raising(OSError(errno.EBADF, os.strerror(errno.EBADF))))
     folder = SocketFolder()
     folder.path.rmdir()
     folder.renew()

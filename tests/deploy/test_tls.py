@@ -3,7 +3,6 @@
 import socket
 import stat
 import subprocess
-import tempfile
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -94,9 +93,8 @@ def lacks_tls() -> bool:
 
 
 @pytest.mark.skipif(lacks_tls(), reason="the Redis server found here was built without TLS")
-def test_redis_takes_encrypted_clients_that_know_the_password(folder: Path) -> None:
-    place = Path(tempfile.mkdtemp(prefix="rmc-tls-"))
-    with RedisServer(place, port=Port("127.0.0.1", free_port(), folder), users=USERS) as server:
+def test_redis_takes_encrypted_clients_that_know_the_password(folder: Path, short: Path) -> None:
+    with RedisServer(short, port=Port("127.0.0.1", free_port(), folder), users=USERS) as server:
         url = server.network_url(LAUNCHER, str(folder / tls.CERTIFICATE))
         bus = RedisBus(url, USERS.run)
         bus.set_config(b"{}")
@@ -183,15 +181,13 @@ def test_who_is_refused_there_reads_one_line_without_the_password(
     assert message in str(raised.value)
 
 
-def test_a_redis_without_tls_is_named(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_redis_without_tls_is_named(folder: Path, short: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(server, "server_binary", lambda: str(get_binary_path()))
-    place = Path(tempfile.mkdtemp(prefix="rmc-tls-"))
     with pytest.raises(ConfigError, match=r"--tls=None: .*needs a redis-server"):
-        RedisServer(place, port=Port("127.0.0.1", free_port(), folder), users=USERS).start()
+        RedisServer(short, port=Port("127.0.0.1", free_port(), folder), users=USERS).start()
 
 
 @pytest.mark.skipif(lacks_tls(), reason="the Redis server found here was built without TLS")
-def test_a_redis_with_tls_that_does_not_start_is_not_said_to_lack_it(tmp_path: Path) -> None:
-    place = Path(tempfile.mkdtemp(prefix="rmc-tls-"))
+def test_a_redis_with_tls_that_does_not_start_is_not_said_to_lack_it(short: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"^--launcher='ray': .*Failed to load certificate.*; mend that, and start"):
-        RedisServer(place, port=Port("127.0.0.1", free_port(), tmp_path), users=USERS).start()
+        RedisServer(short, port=Port("127.0.0.1", free_port(), tmp_path), users=USERS).start()

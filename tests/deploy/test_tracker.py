@@ -223,12 +223,12 @@ def test_an_environment_that_says_much_holds_up_no_film(folder: RunFolder, monke
 
 
 def test_a_checkpoint_that_is_gone_is_one_warning(folder: RunFolder, caplog: pytest.LogCaptureFixture) -> None:
-    tracker = started(folder, "trackio", 1)
+    tracker = started(folder, "videos", 1)
     trained(folder, 700, 1.0)
     wait_until(lambda: tracker.look() or caplog.messages, 60.0)
     tracker.close({"state": "stopped"})
     (message,) = caplog.messages
-    assert message.startswith("trackio: no 000000003.mp4: ")
+    assert message.startswith("videos: no 000000003.mp4: ")
 
 
 def is_film(process: psutil.Process) -> bool:
@@ -241,7 +241,7 @@ def is_film(process: psutil.Process) -> bool:
 
 def test_a_film_that_is_being_made_ends_with_the_tracker(folder: RunFolder) -> None:
     saved(folder)
-    tracker, films = started(folder, "trackio", 1), set[psutil.Process]()
+    tracker, films = started(folder, "videos", 1), set[psutil.Process]()
     trained(folder, 700, 1.0)
     try:
         wait_until(lambda: films.update(filter(is_film, psutil.Process().children(recursive=True))) or films, 60.0)
@@ -281,7 +281,7 @@ def test_a_disk_that_takes_nothing_is_said_and_the_run_goes_on(
 
 
 def test_one_that_dies_is_said_once(folder: RunFolder, caplog: pytest.LogCaptureFixture) -> None:
-    tracker = started(folder, "trackio")
+    tracker = started(folder, "videos")
     tracker._process.kill()
     tracker._process.wait()
     for _ in range(3):
@@ -295,7 +295,7 @@ def test_one_that_hangs_is_not_waited_for(
     folder: RunFolder, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(tracker_module, "FINISH_SECONDS", 0.5)
-    tracker = started(folder, "trackio")
+    tracker = started(folder, "videos")
     tracker._process.send_signal(signal.SIGSTOP)
     began = time.monotonic()
     for _ in range(100):
@@ -326,7 +326,7 @@ def test_one_whose_launcher_was_killed_ends_by_itself(folder: RunFolder) -> None
 
 def test_it_is_told_no_secret_of_the_run(folder: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RMC_SECRET", "hush")
-    tracker = started(folder, "trackio")
+    tracker = started(folder, "videos")
     process = psutil.Process(tracker._process.pid)
     while not (environment := process.environ()):  # the kernel has none to show amid the start of a program
         time.sleep(0.01)

@@ -52,7 +52,8 @@ def _share(folder: Path) -> None:
     hub = Hub()
     named = hub.environment(folder / "home")
     try:
-        push, pull = (python("-m", "rmc.cli.main", *command, folder=folder, **named) for command in commands(HUB))
+        both = f"from rmc.cli.main import run\nfor words in {commands(HUB)}: assert run(words) == 0"
+        push, pull = python("-c", both, folder=folder, **named).splitlines()
         (code,) = re.findall(r"```python\n(.*?)```", HUB, re.DOTALL)
         loaded = python("-c", f"{code}\nprint(action.shape)", folder=folder, **named)
     finally:

@@ -27,12 +27,13 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError, MessageError
 from rmc.common.replay import ObservationStatistics
 from rmc.common.wire import HEADER, Kind, decode_header, decode_meta, encode_frame, encode_windows
-from rmc.deploy.run.config import from_json, from_registration, to_json, to_registration
+from rmc.deploy.run.config import from_registration, to_json, to_registration
 from rmc.deploy.run.presets import robust
 from rmc.replay_server.commit_record import Progress, decode_published
 from tests.faults.asked import LAWFUL_PROOF, Asked
 from tests.faults.row import Row, at_length
 from tests.replay_server.support import SPEC, lawful_rows, make_rows
+from tests.runs import read_config
 
 SLOWEST_S, MOST_MB = 0.010, 64
 TAKEN = "taken"
@@ -144,7 +145,7 @@ KINDS: dict[str, tuple[bytes, Reader]] = {
     "episode": (_request(Kind.EPISODE, {"serial": 3}), request),
     "share": (_request(Kind.SHARE, {"batch_size": 4}), request),
     "record": (encode_record({"time": 1.5, "updates": 7, "waiting_for": "credit"}), decode_record),
-    "config": (to_json(robust(EnvConfig("HalfCheetah-v5"))).encode(), from_json),
+    "config": (to_json(robust(EnvConfig("HalfCheetah-v5"))).encode(), read_config),
     "registration": (to_registration(robust(EnvConfig("HalfCheetah-v5"))), from_registration),
     "counters": (Progress(ObservationStatistics.none(SPEC)).publish(), published),
 }

@@ -16,7 +16,6 @@ from rmc.common.bus.protocol import Version
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.errors import BusUnavailable
 from rmc.deploy.redis.users import LAUNCHER, RedisUsers
-from rmc.deploy.run.config import from_json
 from rmc.deploy.run.folder import RunFolder
 from tests.faults.judge import Acks, Judgement, judge
 from tests.faults.witness import Witness
@@ -59,7 +58,7 @@ class Loaded(Training):
         """Wait for the first updates."""
         self.wait_for_updates()
         run = RunFolder(self.folder)
-        self._users = RedisUsers(run.name, run.secret(), from_json((run.path / "config.json").read_bytes()).roles())
+        self._users = RedisUsers(run.name, run.secret(), run.config().roles())
         self.bus = self.make_bus()
         self.witness.start(self.make_bus())
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from rmc.deploy.run.folder import RunFolder
 from tests.integration.running import ENVIRONMENT, Training
 
 
@@ -22,7 +23,7 @@ def test_training_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     assert mark.exists()
     logs = "".join(path.read_text() for path in (tmp_path / "run" / "logs").glob("*.log"))
     assert "rmc: ENV='tests.broken_env:Hanging-v0': step has not returned for 5 s (broken_env.py, line" in logs
-    records = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
+    records = list(RunFolder(tmp_path / "run").records())
     assert max(record.get("broken_episodes", 0) for record in records) > 0
     assert max(record.get("restarts", 0) for record in records) >= 1
     assert 1200 <= json.loads((tmp_path / "run" / "result.json").read_bytes())["env_steps"] <= 1201

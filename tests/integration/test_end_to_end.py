@@ -11,6 +11,7 @@ import pytest
 import redis
 
 from rmc.analysis.policy_file import decode
+from rmc.deploy.run.folder import RunFolder
 from tests.command import COMMAND
 from tests.docs.running import ran
 from tests.integration.running import Training
@@ -40,8 +41,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Training:
 def test_every_metric_is_in_the_glossary(finished: Training) -> None:
     glossary = (Path(__file__).parents[2] / "docs" / "metrics.md").read_text()
     explained = set(re.findall(r"`([a-z_]+)`", glossary))
-    records = [json.loads(line) for line in (finished.folder / "metrics.jsonl").read_text().splitlines()]
-    names = {name for record in records for name in record} - {"role", "time"}
+    names = {name for record in RunFolder(finished.folder).records() for name in record} - {"role", "time"}
     unexplained = {name for name in names - explained if not name.startswith(("restarts_", "dead_letters_"))}
     assert not unexplained
 
@@ -60,7 +60,7 @@ def test_train_evaluate_stats_and_resume(finished: Training) -> None:
     assert "after training" in training.text()
     assert list(folder.glob("events.out.tfevents.*"))
     assert {"replay", "learner", "actor-0", "evaluator", "launcher"} <= {
-        json.loads(line)["role"] for line in (folder / "metrics.jsonl").read_text().splitlines()
+        record["role"] for record in RunFolder(folder).records()
     }
 
     *_, newest = sorted((folder / "checkpoints").glob("*/policy.safetensors"))  # a copy of which is enough

@@ -1,6 +1,5 @@
-"""Ends that are told: of a role that dies again and again, amid an evaluation, from another terminal, of a tracker."""
+"""Ends that are told: of a role that dies again and again, amid an evaluation, of a tracker."""
 
-import subprocess
 import time
 from pathlib import Path
 
@@ -10,7 +9,6 @@ from rmc.common.checkpoint import CheckpointFolder
 from rmc.deploy.local.supervisor import STOP_SECONDS
 from rmc.deploy.run.folder import RunFolder
 from tests import wandb_file
-from tests.command import COMMAND, rmc
 from tests.integration.running import Training
 from tests.processes import alive
 
@@ -81,24 +79,6 @@ class Broken(InvertedPendulumEnv):
 
 gymnasium.register("Broken-v0", Broken, max_episode_steps=100)
 """
-
-
-def test_a_run_is_watched_and_stopped_from_another_terminal(tmp_path: Path) -> None:
-    with Training(tmp_path / "run", "--total-steps", "10000000") as training:
-        training.wait_for_updates()
-        attach = [*COMMAND, "attach", str(tmp_path / "run")]
-        with subprocess.Popen(attach, stdout=subprocess.PIPE, text=True) as watcher:
-            assert watcher.stdout is not None
-            assert watcher.stdout.readline().startswith("0% | ")
-            done = rmc("stop", str(tmp_path / "run"), timeout=60)
-            assert (done.returncode, done.stderr) == (0, "")
-            assert "to go on:\n  rmc resume " in done.stdout
-            assert training.finish(30) == 130
-            assert "to go on:\n  rmc resume " in watcher.stdout.read()
-            assert watcher.wait(30) == 130
-    done = rmc("attach", str(tmp_path / "run"), timeout=60)
-    assert done.returncode == 2
-    assert "nobody trains it now" in done.stderr
 
 
 @pytest.mark.long  # docs/trackers.md's commands run in tests/docs/test_watching.py

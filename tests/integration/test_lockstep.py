@@ -17,6 +17,7 @@ from rmc.deploy.run.presets import debug
 from rmc.learner.config import LearnerConfig
 from rmc.learner.update import JointUpdate
 from rmc.replay_server.config import ReplayConfig
+from tests.raising import raising
 
 CONFIG = dataclasses.replace(
     debug(EnvConfig("InvertedPendulum-v5")),
@@ -63,11 +64,6 @@ def straight(tmp_path_factory) -> Lockstep:
     return trained(CONFIG, tmp_path_factory.mktemp("straight"))
 
 
-def test_another_seed_other_bits(straight, tmp_path):
-    other = trained(dataclasses.replace(CONFIG, seed=6), tmp_path)
-    assert not torch.equal(bits(straight)["policy.net.0.weight"], bits(other)["policy.net.0.weight"])
-
-
 def test_same_seed_same_bits_also_after_a_stop(straight, tmp_path):
     assert straight.learner.updates > 100
     stopped = trained(CONFIG, tmp_path, stop_after_checkpoints=2)
@@ -84,20 +80,9 @@ def test_counters_stay_where_the_ring_is_lost(tmp_path: Path) -> None:
     assert counts[0] == counts[1] >= 400
 
 
-def test_priorities_of_actors_are_the_same_across_a_stop_too(tmp_path):
-    """They take random actions, whose generator begins anew with each epoch."""
-    agent = dataclasses.replace(CONFIG.agent, initial_priority="actor")
-    config = dataclasses.replace(CONFIG, agent=agent, total_steps=1_000)
-    straight = trained(config, tmp_path / "straight")
-    trained(config, tmp_path / "stopped", stop_after_checkpoints=1)
-    assert_same(straight, trained(config, tmp_path / "stopped"))
-
-
 def test_a_start_that_fails_leaves_no_lock(tmp_path, monkeypatch):
-    def fails(*_):
-        raise RmcError("cannot be made beside the others")
-
     with monkeypatch.context() as patch:
+        fails = raising(RmcError("cannot be made beside the others"))
         patch.setattr("rmc.deploy.local.lockstep.make_evaluator", fails)
         with pytest.raises(RmcError, match="beside the others"):
             Lockstep(CONFIG, tmp_path)

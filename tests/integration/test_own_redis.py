@@ -1,6 +1,5 @@
 """A run in a Redis of the user's own, which stands still, comes back empty, is busy, or has a key of another type."""
 
-import tempfile
 import time
 from contextlib import closing
 from pathlib import Path
@@ -17,10 +16,9 @@ OPTIONS = ("--total-steps", "10000000", "--replay-ratio", "8", "--env-timeout", 
 
 
 @pytest.mark.long
-def test_neither_ends_the_run_or_a_role(tmp_path: Path) -> None:
+def test_neither_ends_the_run_or_a_role(short: Path, tmp_path: Path) -> None:
     with (
-        tempfile.TemporaryDirectory() as short,
-        RedisServer(Path(short)) as server,
+        RedisServer(short) as server,
         Training(tmp_path / "run", *OPTIONS, "--redis-url", server.url()) as training,
     ):
         training.wait_for_updates()
@@ -41,10 +39,9 @@ def test_neither_ends_the_run_or_a_role(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_answers_that_pass_are_waited_out_and_one_that_does_not_names_its_key(tmp_path: Path) -> None:
+def test_answers_that_pass_are_waited_out_and_one_that_does_not_names_its_key(short: Path, tmp_path: Path) -> None:
     with (
-        tempfile.TemporaryDirectory() as short,
-        RedisServer(Path(short)) as server,
+        RedisServer(short) as server,
         Training(tmp_path / "run", *OPTIONS, "--redis-url", server.url()) as training,
         closing(redis.Redis.from_url(server.url())) as client,
     ):

@@ -13,6 +13,7 @@ from rmc.common.bus.memory_bus import MemoryBus
 from rmc.common.replay import SampleStatus
 from rmc.common.shard import Shard
 from rmc.common.window import WindowSpec
+from rmc.deploy.run.folder import RunFolder
 from rmc.learner.batch import importance_weights
 from rmc.learner.sharded_replay import ShardedReplay
 from rmc.replay_server.config import ReplayConfig
@@ -217,8 +218,7 @@ def test_a_whole_run_with_two_shards(tmp_path: Path) -> None:
     assert result["restarts"] == 0
     assert (folder / "replay-0" / "ring").exists()
     assert (folder / "replay-1" / "ring").exists()
-    roles = {json.loads(line)["role"] for line in (folder / "metrics.jsonl").read_text().splitlines()}
-    assert {"replay-0", "replay-1"} <= roles
+    assert {"replay-0", "replay-1"} <= {record["role"] for record in RunFolder(folder).records()}
 
 
 def test_no_shard_draws_as_another_does(wholes: list[Whole]) -> None:

@@ -16,6 +16,7 @@ from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.presets import debug
 from tests.integration.running import Training
 from tests.processes import alive
+from tests.raising import raising
 
 
 @pytest.mark.long
@@ -63,12 +64,8 @@ def test_a_network_disk_that_is_away_for_a_moment_is_no_folder_gone(
     number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = open_run(debug(EnvConfig("InvertedPendulum-v5")), LaunchOptions(tmp_path / "run", "fail"))
-
-    def away(*_: object, **__: object) -> None:
-        raise OSError(number, os.strerror(number))
-
     with monkeypatch.context() as patch:
-        patch.setattr(Path, "stat", away)
+        patch.setattr(Path, "stat", raising(OSError(number, os.strerror(number))))
         folder.lock.check_there()
     folder.lock.release()
 

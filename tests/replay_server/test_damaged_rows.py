@@ -24,7 +24,7 @@ WORDS = {  # field, value, and why a row with it can be none
 }
 DAMAGE = [(name, value) for name, (value, _) in WORDS.items()]
 THERE = [name for name in FLOATS if SPEC.dtype[name].itemsize]
-DAMAGE += [(name, value) for name in THERE for value in (np.nan, np.inf, -np.inf)]
+DAMAGE += [("reward", np.inf), ("reward", -np.inf), *((name, np.nan) for name in THERE)]
 DAMAGE += [("serial", 2**40), ("serial", -1), ("serial", 4)]
 DAMAGE += [("reward", 5.0), ("terminated", 1), ("missing", 1)]  # of a row that could be one
 

@@ -654,12 +654,8 @@ def test_what_is_refused_while_redis_is_full_keeps_nobody_waiting(
 
 
 @pytest.mark.parametrize("bad", [EntryId(2**64 - 1, 2**64 - 1), EntryId(1, 2**63), EntryId(2**31, 0)])
-@pytest.mark.parametrize("kind", ["memory", "redis"])
-def test_an_id_past_all_others_closes_a_stream_to_nobody(
-    make: Make, kind: str, bad: EntryId, redis_url: str, run_name: str
-) -> None:
-    bus: Bus = MemoryBus() if kind == "memory" else RedisBus(redis_url, run_name)
-    server, sender = filled(make(on=bus), bus, 2)
+def test_an_id_past_all_others_closes_a_stream_to_nobody(make: Make, bus: MemoryBus, bad: EntryId) -> None:
+    server, sender = filled(make(), bus, 2)
     bus.append(0, bad, b"anything")
     drain(server)
     assert server.stats()["dead_letters_id"] == 1

@@ -94,7 +94,7 @@ def test_published_counters_that_make_no_sense_are_passed_over(make: Make, bus: 
     assert make().stats()["env_steps"] == 0
 
 
-@pytest.mark.parametrize("place", range(0, 120, 5))
+@pytest.mark.parametrize("place", [0, 60, 115])
 def test_published_counters_with_two_bits_flipped_are_passed_over(
     make: Make, bus: MemoryBus, place: int, caplog: pytest.LogCaptureFixture
 ) -> None:

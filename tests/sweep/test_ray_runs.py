@@ -13,15 +13,17 @@ from typing import Any
 import psutil
 import pytest
 
+from rmc.cli import main, parser, sweep_command
+from rmc.cli.sweep_command import Work
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.folder import RunFolder
 from rmc.sweep import ray_runs
 from rmc.sweep.job import Job
 from rmc.sweep.node_run import _is_abandoned
 from rmc.sweep.parcel import pack, unpack
-from rmc.sweep.ray_runs import RayRun, RayRuns, on_reserved_cores
+from rmc.sweep.ray_runs import RayRun, RayRuns
 from tests.cluster.test_ray import leaves_nothing_behind
-from tests.sweep.sweeping import ENDLESS, Sweeping, write_spec
+from tests.sweep.sweeping import ENDLESS, PENDULUM, Sweeping, write_spec
 
 assert leaves_nothing_behind  # Ray keeps a few files of its own
 RAY = ("--launcher", "ray", "--ray-address", "local")
@@ -91,14 +93,6 @@ def test_nodes_hold_as_many_runs_as_fit_and_one_at_least(monkeypatch: pytest.Mon
     for needs in ((6, 1_000, 0), (1, 9_000_000_000, 0), (1, 1_000, 1)):
         with pytest.raises(ConfigError, match=r"no node of the cluster has .*, which a run takes; start one that has"):
             RayRuns(*needs, at_once=0)
-
-
-def test_a_cluster_that_is_not_there_is_one_line(tmp_path: Path) -> None:
-    spec = str(write_spec(tmp_path))
-    with Sweeping(tmp_path / "sweep", spec, "--launcher", "ray") as sweep:
-        assert sweep.finish() == 2
-    assert sweep.text().startswith("rmc: --ray-address='auto': no Ray cluster answers")
-    assert sweep.text().count("\n") == 1
 
 
 def test_a_copy_is_like_the_folder_and_only_what_changed_is_sent(tmp_path: Path) -> None:
@@ -230,7 +224,27 @@ def _content(folder: Path) -> dict[str, str]:
     return {str(path.relative_to(folder)): path.read_text() for path in files}
 
 
-def test_a_run_takes_one_thread_unless_more_are_asked_for() -> None:
+@pytest.mark.parametrize(
+    ("words", "threads"),
+    [
+        ([], [1]),
+        (["--threads=8"], [8]),
+        (["--grid", "threads=0,2"], [0, 2]),
+        (["--search", "learning_rate=1e-4,1e-3", "--trials", "1"], [1]),
+    ],
+)
+def test_a_run_takes_one_thread_unless_more_are_asked_for(
+    words: list[str], threads: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """As many as are reserved: by itself a learner would try all of the node's cores."""
-    assert on_reserved_cores(("train", "X")) == ("train", "X", "--threads", "1")
-    assert on_reserved_cores(("train", "X", "--threads=8")) == ("train", "X", "--threads=8")
+    sent: list[int] = []
+
+    def send(_: Any, work: Work, *__: Any) -> int:
+        jobs = iter(work.plan.next, None)
+        sent.extend(parser.parse(list(job.words)).config().learner.threads for job in jobs)
+        return 0
+
+    monkeypatch.setattr(sweep_command, "_conduct", send)
+    sweep = ["sweep", PENDULUM, *RAY, "--sweep-dir", str(tmp_path / "sweep"), "--preset", "debug", *words]
+    assert main.run(sweep) == 0
+    assert sent == threads

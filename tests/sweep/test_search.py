@@ -2,7 +2,6 @@
 
 import json
 import re
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ from rmc.sweep.job import Job
 from rmc.sweep.pool import Ending
 from rmc.sweep.spec import Range, Search, Spec, read_spec
 from tests.command import complaint
+from tests.hiding import hide
 from tests.sweep.sweeping import ENDLESS, Sweeping, write_spec
 
 TABLE = (
@@ -220,7 +220,6 @@ def test_a_trial_far_below_the_others_is_stopped_in_order(tmp_path: Path) -> Non
 def test_without_optuna_it_is_said_how_to_install_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setitem(sys.modules, "optuna", None)
-    monkeypatch.delitem(sys.modules, "rmc.sweep.search", raising=False)
+    hide("optuna", monkeypatch)
     words = ["sweep", str(write_spec(tmp_path, TABLE)), "--sweep-dir", str(tmp_path / "sweep")]
-    assert "Optuna is not installed; pip install" in complaint(words, capsys)
+    assert "search='': optuna is missing; pip install" in complaint(words, capsys)
