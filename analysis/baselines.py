@@ -146,7 +146,7 @@ class _Run(BaseCallback):
         """Agent steps so far."""
         return self._model.steps
 
-    # -- training ---------------------------------------------------------------------------------------
+    # Training
 
     def train(self) -> None:
         """To the end or the signal; what is not saved then is saved."""
@@ -175,7 +175,7 @@ class _Run(BaseCallback):
     def _after(self, steps: int) -> int:
         return (steps // self.config.checkpoint_steps + 1) * self.config.checkpoint_steps
 
-    # -- evaluation and records -------------------------------------------------------------------------
+    # Evaluation and records
 
     def _play(self, episodes: int, final: bool) -> dict[str, Any]:
         player, seed = self._model.player(), first_start(self.config.seed, final)

@@ -46,7 +46,7 @@ from rmc.learner.batch import clear_padding, view_batch
 from rmc.learner.config import Precision
 from rmc.learner.learner import Learner
 from rmc.learner.precision import has_fast_bf16
-from rmc.learner.replay_client import ReplayClient
+from rmc.learner.replay.client import ReplayClient
 from rmc.learner.update_order import make_update
 from rmc.replay_server.config import ReplayConfig
 

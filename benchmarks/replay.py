@@ -40,7 +40,7 @@ from rmc.common.replay import SampleStatus
 from rmc.common.window import WindowSpec
 from rmc.learner.batch import Batch, clear_padding, importance_weights, view_batch
 from rmc.learner.config import LearnerConfig
-from rmc.learner.replay_client import ReplayClient
+from rmc.learner.replay.client import ReplayClient
 from rmc.replay_server.config import ReplayConfig
 
 BATCH = 256

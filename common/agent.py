@@ -3,7 +3,7 @@
 Shapes: B batch, T time, O observation, A action, H hidden, S state, E embedding, Z = H, O or H + O head input, M flags
 of what is missing (1 for a whole frame, or O), P privileged numbers, which critics alone read.
 Equations are in ``learner/losses.py``; here is only what maps inputs to outputs. What must be fast is written again:
-``learner/fused.py`` for bfloat16 on a CPU, ``actors/policy_runner.py`` for acting; tests compare them with this.
+``learner/bfloat16/`` for bfloat16 on a CPU, ``actors/policy_runner.py`` for acting; tests compare them with this.
 """
 
 import math

@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from rmc.common.agent import Agent
-from rmc.learner import kernels
+from rmc.learner.bfloat16 import kernels
+from rmc.learner.bfloat16.rounded import rounded_weights
 from rmc.learner.config import UpdateConfig
-from rmc.learner.rounded import rounded_weights
 
 NOT_ROUNDED = np.empty(0, np.uint16)
 
 
 class CompiledAdam(torch.optim.Adam):
-    """torch's Adam by ``learner/kernels.py``, which rounds weights for the next products in the same pass."""
+    """torch's Adam by ``learner/bfloat16/kernels.py``, which rounds weights for the next products in the same pass."""
 
     # torch's own, without the decorator that imports its compiler, 1.5 s, only to keep the compiler off them
     add_param_group = inspect.unwrap(torch.optim.Adam.add_param_group)

@@ -21,9 +21,9 @@ from rmc.common.critic import critic_input
 from rmc.common.window import WindowSpec
 from rmc.learner import losses
 from rmc.learner.batch import Batch, Plan, has_missing, longest_steps
+from rmc.learner.bfloat16.fused import fuse
 from rmc.learner.config import UpdateConfig
 from rmc.learner.diagnostics import actor_critic_metrics, model_metrics, unexplained_change
-from rmc.learner.fused import fuse
 from rmc.learner.optimizers import by_optimizer, make_adam, polyak_update
 from rmc.learner.policy_average import PolicyAverage
 from rmc.learner.unroll import impute_and_unroll, unroll

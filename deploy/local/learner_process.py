@@ -20,8 +20,8 @@ from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.host import cores
 from rmc.deploy.run.preflight import check_device, thread_choices, two_processes
 from rmc.learner.learner import Learner
-from rmc.learner.replay_client import ReplayClient
-from rmc.learner.sharded_replay import ShardedReplay
+from rmc.learner.replay.client import ReplayClient
+from rmc.learner.replay.sharded import ShardedReplay
 
 
 def run_learner(connection: RunConnection, folder: Path, device: str) -> int:

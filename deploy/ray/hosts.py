@@ -159,7 +159,7 @@ class Hosts:
         learner = self._handles.get("learner")
         return learner is not None and learner.report is not None and learner.report.status == 0
 
-    # -- the end --------------------------------------------------------------------------------------
+    # The end
 
     def tell_stop(self) -> None:
         """That the run ends: what ends now is not started again. A new launcher hears first who runs."""

@@ -131,7 +131,7 @@ class RunConfig:
         return 2 * self.window_spec().train * self.actor.envs_per_actor * self.actors
 
 
-# -- JSON ---------------------------------------------------------------------------------------------
+# JSON
 
 
 def to_json(config: RunConfig) -> str:

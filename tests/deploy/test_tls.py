@@ -21,7 +21,7 @@ from rmc.deploy.redis.connect import Deadline, connect
 from rmc.deploy.redis.server import Port, RedisServer, server_binary
 from rmc.deploy.redis.users import LAUNCHER, RedisUsers
 from rmc.deploy.run import tls
-from rmc.learner.replay_client import ReplayClient
+from rmc.learner.replay.client import ReplayClient
 from rmc.replay_server.config import ReplayConfig
 from tests.integration.running import free_port
 from tests.replay_server.served import Served

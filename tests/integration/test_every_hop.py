@@ -21,7 +21,7 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.replay import SampleStatus
 from rmc.deploy.run.config import to_registration
 from rmc.deploy.run.presets import debug
-from rmc.learner.replay_client import ReplayClient
+from rmc.learner.replay.client import ReplayClient
 from rmc.replay_server.config import ReplayConfig
 from tests.command import COMMAND
 from tests.counting_env import Step, audit

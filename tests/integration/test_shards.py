@@ -15,7 +15,7 @@ from rmc.common.shard import Shard
 from rmc.common.window import WindowSpec
 from rmc.deploy.run.folder import RunFolder
 from rmc.learner.batch import importance_weights
-from rmc.learner.sharded_replay import ShardedReplay
+from rmc.learner.replay.sharded import ShardedReplay
 from rmc.replay_server.config import ReplayConfig
 from rmc.replay_server.server import ReplayServer
 from tests.integration.running import Training

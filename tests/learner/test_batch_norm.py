@@ -10,8 +10,8 @@ from torch import Tensor
 from rmc.common.agent import Agent
 from rmc.common.agent_config import AgentConfig
 from rmc.common.critic import MOMENTUM, VARIANCE_EPS, BatchNorm, TwinQ
+from rmc.learner.bfloat16.fused import fuse
 from rmc.learner.config import UpdateConfig
-from rmc.learner.fused import fuse
 from rmc.learner.update_order import make_update
 from tests.learner.agents import distance
 from tests.learner.rows import SPEC, random_rows, to_batch

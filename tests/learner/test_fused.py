@@ -11,10 +11,10 @@ import torch
 
 from rmc.common.agent import Agent
 from rmc.common.agent_config import AgentConfig
-from rmc.learner import kernels
+from rmc.learner.bfloat16 import kernels
+from rmc.learner.bfloat16.fused import FusedGRU, fuse
+from rmc.learner.bfloat16.fused_heads import FusedHead, FusedTwinQ
 from rmc.learner.config import UpdateConfig
-from rmc.learner.fused import FusedGRU, fuse
-from rmc.learner.fused_heads import FusedHead, FusedTwinQ
 from rmc.learner.update_order import make_update
 from tests.learner.agents import distance
 from tests.learner.rows import SPEC, random_rows, to_batch

@@ -8,12 +8,12 @@ from torch import nn
 
 from rmc.common.agent import Agent
 from rmc.common.agent_config import AgentConfig
+from rmc.learner.bfloat16.fused import fuse
+from rmc.learner.bfloat16.fused_heads import FusedHead
+from rmc.learner.bfloat16.kernels import BLOCK
+from rmc.learner.bfloat16.rounded import Rounded, rounded_weights
 from rmc.learner.config import UpdateConfig
-from rmc.learner.fused import fuse
-from rmc.learner.fused_heads import FusedHead
-from rmc.learner.kernels import BLOCK
 from rmc.learner.optimizers import CompiledAdam, begin_moments, make_adam, polyak_update
-from rmc.learner.rounded import Rounded, rounded_weights
 from rmc.learner.update_order import make_update
 from tests.learner.rows import SPEC, random_rows, to_batch
 

@@ -6,8 +6,8 @@ import threading
 from pathlib import Path
 
 from rmc.common.bus.memory_bus import MemoryBus
-from rmc.learner.replay_client import ReplayClient
-from rmc.learner.replay_connection import ReplayConnection
+from rmc.learner.replay.client import ReplayClient
+from rmc.learner.replay.connection import ReplayConnection
 from rmc.replay_server.config import ReplayConfig
 from rmc.replay_server.server import ReplayServer
 from rmc.replay_server.socket_server import SocketServer

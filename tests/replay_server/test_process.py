@@ -16,7 +16,7 @@ from rmc.common.errors import BusUnavailable, FencedError
 from rmc.common.process.role import StopSignal, run_role
 from rmc.common.replay import SampleStatus
 from rmc.deploy.redis.server import RedisServer
-from rmc.learner.replay_client import ReplayClient
+from rmc.learner.replay.client import ReplayClient
 from rmc.replay_server import process
 from rmc.replay_server.config import ReplayConfig
 from rmc.replay_server.process import ReplayProcess

@@ -13,7 +13,7 @@ import pytest
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.errors import ConfigError
 from rmc.common.replay import SampleStatus
-from rmc.learner.replay_client import ReplayClient
+from rmc.learner.replay.client import ReplayClient
 from rmc.replay_server.recovery import ReplayStore, open_store, valid_leaves, warn_of_torn_rows
 from rmc.replay_server.sum_tree import SumTree
 from tests.holding import held_for_a_moment

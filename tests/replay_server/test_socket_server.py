@@ -20,8 +20,8 @@ from rmc.common.errors import AuthenticationError, ConfigError, FencedError, Mes
 from rmc.common.replay import Sample, SampleStatus
 from rmc.common.shared_batches import TURNS
 from rmc.common.wire import HEADER, MAGIC, VERSION, Kind, decode_header, decode_meta, encode_frame, proof
-from rmc.learner.replay_client import ReplayClient
-from rmc.learner.replay_connection import ReplayConnection
+from rmc.learner.replay.client import ReplayClient
+from rmc.learner.replay.connection import ReplayConnection
 from rmc.replay_server import socket_server
 from rmc.replay_server.config import ReplayConfig
 from rmc.replay_server.socket_server import SocketServer

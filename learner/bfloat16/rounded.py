@@ -16,7 +16,7 @@ def applies(x: Tensor) -> bool:
 
 
 def bits(x: Tensor) -> NDArray[np.uint16]:
-    """bfloat16 as ``learner/kernels.py`` takes it, the same memory."""
+    """bfloat16 as ``learner/bfloat16/kernels.py`` takes it, the same memory."""
     same: NDArray[np.uint16] = x.view(torch.uint16).numpy()
     return same
 

@@ -1,7 +1,7 @@
 """The networks as fast as a CPU with bfloat16 products takes them: the same parameters, the same equations.
 
 ``fuse`` swaps the GRU and the heads of an Agent for these. Under bfloat16 autocast each is one node of the gradient's
-graph: products by torch, all between them by ``learner/kernels.py``, weight gradients in one product over all steps.
+graph: products by torch, all between them by ``kernels.py`` here, weight gradients in one product over all steps.
 Without autocast, and on a GPU, they are what they were. Shapes: B batch, T time.
 """
 
@@ -14,9 +14,9 @@ from torch.autograd.function import once_differentiable
 
 from rmc.common.agent import Agent, Float32Linear
 from rmc.common.agent_config import NORMALIZED_CLIP
-from rmc.learner import kernels
-from rmc.learner.fused_heads import FusedHead, FusedTwinQ, relu_layer
-from rmc.learner.rounded import BF16, Rounded, applies, bits
+from rmc.learner.bfloat16 import kernels
+from rmc.learner.bfloat16.fused_heads import FusedHead, FusedTwinQ, relu_layer
+from rmc.learner.bfloat16.rounded import BF16, Rounded, applies, bits
 
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
 

@@ -24,7 +24,7 @@ from rmc.common.replay import EMPTY_SAMPLE, EPISODE_BYTES, ObservationStatistics
 from rmc.common.shared_batches import SharedBatches
 from rmc.common.window import Rows, WindowSpec
 from rmc.common.wire import Kind
-from rmc.learner.replay_connection import ReplayConnection
+from rmc.learner.replay.connection import ReplayConnection
 
 log = logging.getLogger(__name__)
 AHEAD = 2  # draws in flight, so that the server gathers while the learner computes

@@ -1,4 +1,4 @@
-"""Heads and critics of ``learner/fused.py``: one node of the gradient's graph for all their layers.
+"""Heads and critics of ``fused.py``: one node of the gradient's graph for all their layers.
 
 Shapes: S nets side by side, N = B T rows, K units, Z head input, A action.
 """
@@ -11,8 +11,8 @@ from torch.autograd.function import once_differentiable
 
 from rmc.common.agent import Float32Linear
 from rmc.common.critic import MOMENTUM, VARIANCE_EPS, BatchNorm, StackedLinear, TwinQ, shares
-from rmc.learner import kernels
-from rmc.learner.rounded import BF16, Rounded, applies, bits
+from rmc.learner.bfloat16 import kernels
+from rmc.learner.bfloat16.rounded import BF16, Rounded, applies, bits
 
 
 class FusedHead(Rounded, nn.Sequential):

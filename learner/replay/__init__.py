@@ -1,0 +1,1 @@
+"""The learner's side of the replay servers: the draws and the priorities, over sockets."""
