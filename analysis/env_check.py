@@ -26,7 +26,7 @@ from rmc.common.env.wrappers import Env
 from rmc.common.errors import EnvFault
 from rmc.common.window import BoolArray, Floats
 from rmc.deploy.run.config import WindowConfig
-from rmc.deploy.run.env_sizes import layout_sizes
+from rmc.deploy.run.env_sizes import env_sizes, layout_sizes
 from rmc.deploy.run.memory_reach import format_reach
 
 BESIDE_THE_POINT = (  # of vectors, stretched actions, what watches the environment, and what is judged better below
@@ -209,7 +209,7 @@ def _second(config: EnvConfig, layout: EnvLayout) -> Iterator[str]:
     """Whether another one of the same sizes can be played while the first is there, as in training."""
     try:
         with closing(make_env(config)) as env:
-            sizes = layout_sizes(layout_of(env, config, {}, privileged=False))
+            sizes = env_sizes(env, config)
             Played().play(env, 1, seed=0)  # as the first one stood it
     except Exception as error:
         fix = "take --actors 1 --envs-per-actor 1 --episodes 0"

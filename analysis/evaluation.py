@@ -13,13 +13,12 @@ from rmc.actors.policy_runner import one_thread
 from rmc.analysis.policy_file import PolicyFile, policy_runner
 from rmc.common.agent import initial_agent
 from rmc.common.env.config import EnvConfig
-from rmc.common.env.describe import layout_of
 from rmc.common.env.make import first_env
 from rmc.common.env.wrappers import Env
 from rmc.common.errors import ConfigError, EnvFault
 from rmc.common.policy_header import PolicyHeader
 from rmc.deploy.run.config import RunConfig
-from rmc.deploy.run.env_sizes import check_sizes, layout_sizes
+from rmc.deploy.run.env_sizes import check_sizes, env_sizes, layout_sizes
 
 FINAL_EPISODES = 10  # of a run's first and last evaluation
 SAY_SECONDS = 10.0  # between lines that an evaluation goes on
@@ -57,8 +56,7 @@ def policy_env(header: PolicyHeader, config: EnvConfig) -> Env:
     """An environment for a policy to act in. Raises ConfigError, also where its sizes are not the policy's."""
     env = first_env(config)
     try:
-        layout = layout_of(env, config, {}, privileged=False)
-        check_sizes(config.id, layout_sizes(header.layout), layout_sizes(layout))
+        check_sizes(config.id, layout_sizes(header.layout), env_sizes(env, config))
     except ConfigError:
         env.close()
         raise

@@ -58,7 +58,7 @@ def returns(agents: dict[str, list[History]], by: Axis) -> str:
             draw_agent(panel, lines, index)
         panel.set_xlabel(f"wall time ({unit})" if unit else LABELS[by])
         panel.set_ylabel("evaluation return")
-        panel.locator_params(axis="x", nbins=6)
+        panel.locator_params(axis="x", nbins=6, integer=by == "env_steps")
         if by == "env_steps":
             panel.xaxis.set_major_formatter(EngFormatter(sep=""))
         return _drawn(figure)

@@ -41,7 +41,7 @@ BY_FUNCTION = {  # the first that a stack has, from its outermost frame on
         "update.py:after_model_step", "update.py:after_actor_critic_step", "policy_average.py:update",
     },
     "batches, priorities": {
-        "replay_client.py:sample", "replay_client.py:update_priorities", "batch.py:view_batch", "learner.py:_flush",
+        "client.py:sample", "client.py:update_priorities", "batch.py:view_batch", "learner.py:_flush",
     },
     "broadcasts, metrics": {"learner.py:publish", "learner.py:metrics", "learner.py:checkpoint"},
 }  # fmt: skip

@@ -2,7 +2,7 @@
 
 Shapes: B batch, L_b burn-in, L_t trained steps, O observation, A action, H hidden, S state, Z head input, M flags of
 what is missing, P privileged.
-z_t is what heads read: h_t, the paper's s_t, with o_t beside it where configured.
+z_t is what heads read: h_t, the paper's s_t, or o_t, or both, as configured.
 Nothing here waits for the host: no ``.item()``, no branch on a tensor, static shapes.
 """
 
@@ -135,11 +135,12 @@ class JointUpdate:
             # Memory: h_t from the stored state, burned in without gradient
             o, remembered = impute_and_unroll(agent, o, batch)
             z = self._to_bf16(agent.features(remembered))
-            memories = {"online": remembered}
+            memories, read = {"online": remembered}, {"online": z}
             if self.ema_memory is not None:
                 with torch.no_grad():
                     memories["ema"] = unroll(self.ema_memory, o, batch)
-            next_z = self._to_bf16(agent.features(memories[c.target_memory]))[:, 1:].detach()
+                    read["ema"] = self._to_bf16(agent.features(memories["ema"]))
+            next_z = read[c.target_memory][:, 1:].detach()
 
             # Prediction of h_{t+1} - h_t, and curiosity from its error
             h = memories[c.latent_target].hidden.detach().float()

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
-from rmc.common.env.describe import layout_of
 from rmc.common.env.make import make_env
 from rmc.common.env.wrappers import Env
 from rmc.common.errors import BusFull, BusUnavailable, ConfigError, RmcError
@@ -19,7 +18,7 @@ from rmc.common.process.role import RECONNECT_SLEEP, StopSignal
 from rmc.deploy.local.role_environment import SECRET_VARIABLE
 from rmc.deploy.redis.connect import PATIENCE_SECONDS, PATIENCE_VARIABLE, Deadline, connect
 from rmc.deploy.run.config import RunConfig, from_registration
-from rmc.deploy.run.env_sizes import check_sizes, layout_sizes
+from rmc.deploy.run.env_sizes import check_sizes, env_sizes
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -104,8 +103,7 @@ class Process:
     def make_env(self, privileged: bool = False) -> Env:
         """A new environment of the run, as ``make_env``. Raises ConfigError where its sizes are not the launcher's."""
         env = make_env(self.config.env, privileged=privileged)
-        layout = layout_of(env, self.config.env, {}, privileged=False)
-        check_sizes(self.config.env.id, self.config.sizes(), layout_sizes(layout))
+        check_sizes(self.config.env.id, self.config.sizes(), env_sizes(env, self.config.env))
         return env
 
 

@@ -19,10 +19,10 @@ class Registration:
     def __init__(self, config: RunConfig, folder: RunFolder, bus: RedisBus) -> None:
         """Make the run known, afresh. Raises BusUnavailable, BusFull."""
         self._config, self._bus = to_registration(config), bus
-        self._progress_backup = ProgressBackup(folder, config.replay.replay_shards)
         self._look_at = 0.0
         bus.expire(None)
         bus.clear_stop()  # before the config, which roles that are started by hand may wait for
+        self._progress_backup = ProgressBackup(folder, config.replay.replay_shards)  # tells of a damaged file
         self._publish()
 
     def change(self, config: RunConfig) -> None:

@@ -2,7 +2,10 @@
 
 from typing import Any
 
+from rmc.common.env.config import EnvConfig
+from rmc.common.env.describe import layout_of
 from rmc.common.env.layout import EnvLayout
+from rmc.common.env.wrappers import Env
 from rmc.common.errors import ConfigError
 
 FLAGS = "flags of what is missing"
@@ -12,6 +15,11 @@ def layout_sizes(layout: EnvLayout) -> dict[str, Any]:
     """Those that every agent depends on, as ``RunConfig.sizes`` names them."""
     extremes = {"the lowest actions": list(layout.action_low), "the highest actions": list(layout.action_high)}
     return {"observations": layout.obs_dim, "actions": layout.action_dim, **extremes}
+
+
+def env_sizes(env: Env, config: EnvConfig) -> dict[str, Any]:
+    """The same of an environment as ``make_env`` gives it."""
+    return layout_sizes(layout_of(env, config, {}, privileged=False))
 
 
 def check_sizes(env_id: str, before: dict[str, Any], sizes: dict[str, Any]) -> None:

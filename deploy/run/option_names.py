@@ -34,6 +34,11 @@ def option(path: str) -> str:
     return POSITIONAL.get(path) or "--" + path.rpartition(".")[2].replace("_", "-")
 
 
+def flag(word: str) -> str:
+    """The option that a typed word names, ``--replay-ratio`` for ``--replay_ratio=96``; another word as it is."""
+    return word.partition("=")[0].replace("_", "-")
+
+
 def did_you_mean(word: str, known: Iterable[str], otherwise: str = "") -> str:
     """The end of a message on a word that is not known: what is most like it, or ``otherwise``."""
     plain, names = word.lstrip("-"), {name.lstrip("-"): name for name in known}

@@ -1,1 +1,1 @@
-"""An update on a CPU with bfloat16 products: the networks and Adam again, in compiled passes."""
+"""The networks again, in compiled passes over bfloat16 products, and the kernel of every CPU's Adam."""

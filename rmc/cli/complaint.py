@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from rmc.cli import config_file
 from rmc.cli.parser import COMMANDS, option_names, parse
 from rmc.common.errors import ConfigError
-from rmc.deploy.run.option_names import did_you_mean, option
+from rmc.deploy.run.option_names import did_you_mean, flag, option
 
 SAYS_ON_OR_OFF = re.compile("true|false|yes|no|on|off", re.IGNORECASE)
 ENDS = ("For full helptext", "Argument helptext", "Arguments are applied", "Perhaps you meant", "Available subcommands")
@@ -45,10 +45,10 @@ def as_line(boxed: str, words: Sequence[str]) -> str:
 def _switch(message: str, words: Sequence[str]) -> str:
     """Of an option that takes no value, and was given one that says on or off; else nothing."""
     for word, after in itertools.zip_longest(words, words[1:], fillvalue=""):
-        flag, equals, value = word.partition("=")
+        said, equals, value = word.partition("=")
         value = value if equals else after
-        if flag.startswith("--") and SAYS_ON_OR_OFF.fullmatch(value) and message == f"Unrecognized options: {value}":
-            name = flag.removeprefix("--").removeprefix("no-")
+        if said.startswith("--") and SAYS_ON_OR_OFF.fullmatch(value) and message == f"Unrecognized options: {value}":
+            name = said.removeprefix("--").removeprefix("no-")
             return f"; write --{name} or --no-{name}, without a value"
     return ""
 
@@ -61,10 +61,9 @@ def _near(words: Sequence[str]) -> str:
     command, *rest = words or [""]
     if command not in options:
         return did_you_mean(command, options)
-    flags = [word.partition("=")[0].replace("_", "-") for word in rest if word.startswith("--")]
-    for flag in flags:
-        if flag.replace("--no-", "--", 1) in options[command]:
+    for name in [flag(word) for word in rest if word.startswith("--")]:
+        if name.replace("--no-", "--", 1) in options[command]:
             continue
-        others = [f"rmc {other}" for other, known in options.items() if flag in known and other != "role"]
-        return f"; {flag} is an option of {others[0]}" if others else did_you_mean(flag, options[command])
+        others = [f"rmc {other}" for other, known in options.items() if name in known and other != "role"]
+        return f"; {name} is an option of {others[0]}" if others else did_you_mean(name, options[command])
     return ""

@@ -9,7 +9,7 @@ from rmc.common.bus.redis_url import value_without_passwords
 from rmc.common.env.config import check_kwargs, write_kwargs
 from rmc.common.errors import ConfigError
 from rmc.common.user_path import user_path
-from rmc.deploy.run.option_names import did_you_mean, option_words, plain_names, read_toml
+from rmc.deploy.run.option_names import did_you_mean, flag, option_words, plain_names, read_toml
 
 RENAMED = {
     "fill-blanks": "impute-missing",
@@ -30,7 +30,7 @@ def with_file(words: list[str], names: Sequence[str]) -> tuple[list[str], str]:
     env, options = read_options(path, names)
     kwargs = options.pop("env_kwargs", {})
     file_words = [word for name, value in options.items() for word in option_words(name, value)]
-    if any(word.partition("=")[0].replace("_", "-") == KWARGS for word in words):
+    if any(flag(word) == KWARGS for word in words):
         kwargs = {}
     last = [KWARGS, *write_kwargs(kwargs)] if kwargs else []
     own = words[1:]
@@ -76,11 +76,7 @@ def read_options(path: Path, names: Sequence[str]) -> tuple[str, dict[str, Any]]
 def option_values(option: str, words: Sequence[str]) -> list[str]:
     """What an option is given, in its order, as ``--option VALUE`` or ``--option=VALUE``."""
     pairs = itertools.zip_longest(words, words[1:])
-    found = (
-        word.partition("=")[2] if "=" in word else after
-        for word, after in pairs
-        if word.partition("=")[0].replace("_", "-") == option
-    )
+    found = (word.partition("=")[2] if "=" in word else after for word, after in pairs if flag(word) == option)
     return [value for value in found if value is not None]
 
 

@@ -19,7 +19,7 @@ from rmc.deploy.run.config import Preset, RunConfig
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.opening import MAY_CHANGE
-from rmc.deploy.run.option_names import flat
+from rmc.deploy.run.option_names import flag, flat
 from rmc.deploy.run.presets import preset_config
 from rmc.deploy.run.starts import last_launch
 
@@ -141,7 +141,7 @@ def _parsed(words: list[str], defaults: dict[str, Any]) -> Any:
 
 def _check_sweep_begins(words: list[str]) -> None:
     """Raises ConfigError where an option of rmc train comes first: whether a value follows it is not known."""
-    first = words[0].partition("=")[0].replace("_", "-") if words else ""
+    first = flag(words[0]) if words else ""
     own = {word.replace("_", "-") for word in option_names(COMMANDS["sweep"][0])}
     if first.startswith("--") and first not in HELP and first.removeprefix("--").removeprefix("no-") not in own:
         raise ConfigError("ENV|SPEC.toml", first, "give it first; options of rmc train follow it")
@@ -173,7 +173,7 @@ def option_names(kind: type) -> list[str]:
 
 def _check_once(option: str, words: list[str]) -> None:
     """Of two, the parser would drop the first without a word."""
-    uses = [word for word in words if word.partition("=")[0].replace("_", "-") == option]
+    uses = [word for word in words if flag(word) == option]
     if len(uses) > 1:
         raise ConfigError(option, " ".join(uses), "is there twice; give all of NAME=VALUE after one")
 

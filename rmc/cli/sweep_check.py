@@ -15,7 +15,7 @@ from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.opening import check_start
-from rmc.deploy.run.option_names import flat, option, option_words
+from rmc.deploy.run.option_names import flag, flat, option, option_words
 from rmc.deploy.run.preflight import check_machine
 from rmc.deploy.run.tracking import choose_tracking
 from rmc.deploy.run.validation import validate, validate_launch
@@ -50,7 +50,7 @@ def with_file(spec: Spec) -> Spec:
 
 def check_values(spec: Spec, on_this_machine: bool) -> None:
     """Raises ConfigError, which names the key, for the first value that rmc train would not read."""
-    given = {word.partition("=")[0].replace("_", "-") for word in spec.words}
+    given = set(map(flag, spec.words))
     typed = " ".join(map(without_passwords, spec.words))
     if not on_this_machine and "--init-from" in spec.said():
         raise ConfigError("--init-from", typed, "the nodes do not have that file; leave it")
@@ -113,7 +113,7 @@ def as_planned(job: Job, config: RunConfig, options: LaunchOptions) -> Job:
         "--total-steps": config.total_steps, "--actors": config.actors, "--threads": config.learner.threads,
         "--device": options.device, "--launcher": options.launcher,
     }  # fmt: skip
-    said = {word.partition("=")[0].replace("_", "-") for word in job.words}
+    said = set(map(flag, job.words))
     unsaid = [word for name, value in planned.items() if name not in said for word in (name, str(value))]
     return dataclasses.replace(job, words=(*job.words, *unsaid))
 

@@ -15,7 +15,7 @@ from rmc.common.bus.metrics_record import is_finite
 from rmc.common.bus.redis_url import value_without_passwords
 from rmc.common.env.config import PYTHONS, EnvConfig, check_kwargs
 from rmc.common.errors import ConfigError
-from rmc.deploy.run.option_names import did_you_mean, flat, option, plain_names, read_toml
+from rmc.deploy.run.option_names import did_you_mean, flag, flat, option, plain_names, read_toml
 from rmc.deploy.run.presets import robust
 
 KEYS = ("env", "seeds", "options", "grid", "search")
@@ -90,7 +90,7 @@ class Spec:
 
     def said(self) -> set[str]:
         """The options that are typed, that every run has, or that are varied."""
-        typed = {word.partition("=")[0].replace("_", "-") for word in self.words}
+        typed = set(map(flag, self.words))
         return typed.union(map(option, (*self.options, *self.grid, *(self.search.ranges if self.search else {}))))
 
     def _check_search(self, search: Search) -> None:

@@ -6,7 +6,8 @@ from types import ModuleType
 import pytest
 
 from benchmarks import update_time
-from rmc.learner import fused_heads, rounded
+from rmc.learner.bfloat16 import fused_heads, rounded
+from rmc.learner.replay import client
 
 
 def frame(module: ModuleType, function: str, text: str) -> str:
@@ -21,6 +22,7 @@ def frame(module: ModuleType, function: str, text: str) -> str:
         (frame(fused_heads, "relu_layer", "y = torch.mm(x, w)"), "matrix products"),
         (frame(fused_heads, "relu_layer", "kernels.bias_relu("), "gates, biases, ReLUs"),
         (frame(rounded, "bf16", "low.copy_(weight.detach())"), "Adam, rounding"),
+        (frame(client, "sample", "def sample("), "batches, priorities"),
         (frame(fused_heads, "_heads", "return out.reshape("), update_time.OTHER),
     ],
 )

@@ -18,6 +18,7 @@ from rmc.common import agent, critic
 from rmc.common.env import missing
 from rmc.common.env.config import EnvConfig
 from rmc.deploy.run import presets
+from rmc.deploy.run.option_names import flat, option
 from rmc.learner import diagnostics, losses, update, update_order
 from tests.cli.test_main import OTHER_FLAGS, TRAIN_FLAGS
 from tests.command import rmc
@@ -186,11 +187,16 @@ def test_the_docs_name_options_that_exist() -> None:
         "--cap-drop", "--exclude", "--generate", "--logdir", "--network", "--no-restart", "--node-ip-address",
         "--read-only", "--rm", "--shm-size", "--user",
     }  # fmt: skip  # of others
+    switches = [
+        path for path, value in flat(presets.debug(EnvConfig("Pendulum-v1"))).items() if isinstance(value, bool)
+    ]
+    there |= {option(path).replace("--", "--no-", 1) for path in switches}
     there |= {"--version", "--help", "--help-all"}  # alone
+    there |= {"--no-all-cpus", "--no-prune", "--no-video"}  # of where a run is, of a sweep, of a report
     there |= {"--alone", "--first-rate", "--only", "--env", "--play"}  # of benchmarks and studies
     for page in PAGES:
         named = re.findall(r"(?<![\w-])--[a-z][a-z-]*[a-z]", page.read_text())
-        assert {flag for flag in named if not {flag, flag.replace("--no-", "--")} & there} == set(), page
+        assert set(named) - there == set(), page
 
 
 def test_the_commands_of_all_pages_can_be_parsed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

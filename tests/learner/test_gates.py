@@ -50,6 +50,10 @@ def test_the_policy_before_training_is_the_one_that_the_learner_starts_from(tmp_
     ours, theirs = safetensors.torch.load(initial_policy(config)), run.learner.agent.policy_weights()
     assert {name for name, value in theirs.items() if not torch.equal(ours[name], value)} == set()
     run.close()
+
+
+def test_another_seed_is_another_policy_before_training() -> None:
+    config = debug(EnvConfig("InvertedPendulum-v5"))
     assert initial_policy(dataclasses.replace(config, seed=1)) != initial_policy(config)
 
 
