@@ -143,9 +143,9 @@ def test_a_run_started_by_hand_whose_launcher_fails_is_stopped_and_leaves_nothin
 
 
 def test_a_redis_that_is_away_for_a_moment_ends_no_start(
-    tmp_path: Path, redis_url: str, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, redis_url: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """As a network resets a connection right after it was tried."""
+    """As a network resets a connection right after it was tried. What is amiss in the folder is told once."""
     expire, moments = RedisBus.expire, [2, 10**9]
 
     def away(bus: RedisBus, seconds: int | None) -> None:
@@ -156,9 +156,11 @@ def test_a_redis_that_is_away_for_a_moment_ends_no_start(
 
     monkeypatch.setattr(RedisBus, "expire", away)
     folder = RunFolder(tmp_path)
+    (tmp_path / "replay-counters").write_bytes(b"damaged")
     stop = StopSignal()
     with closing(RunRedis(CONFIG, folder, stop, redis_url)) as own:
         assert from_registration(own.bus.config() or b"") == CONFIG
+    assert caplog.text.count("replay-counters: cannot be read") == 1
     monkeypatch.setattr(connect, "AWAY_SECONDS", 0.5)
     moments.pop(0)
     with pytest.raises(BusUnavailable, match="reset by peer"):
