@@ -23,7 +23,8 @@ Axis = Literal["env_steps", "updates", "wall_s"]
 LABELS = {"env_steps": "agent steps", "updates": "updates", "wall_s": "wall time (s)"}
 LEGEND_WIDTH, LEGEND_LINE = 55, 0.22  # characters under a panel, inches
 SAME_LENGTH = 1.05  # runs overshoot their end a little
-POINTS, CURVE_RESAMPLES, COLUMNS, LAST, WIDTH = 100, 300, 3, 5, 120
+POINTS, CURVE_RESAMPLES, COLUMNS, LAST = 100, 300, 3, 5
+WIDTH, AGENT_WIDTH = 1_000, 60  # of the table, as a cut return is none, and of a name until it goes on below
 DASHES = ("-", "--", ":", "-.")
 HEADINGS = ("agent", "seeds", "return", f"worst of last {LAST}", "steps", "updates", "wall s")
 Groups = dict[str, dict[str, list[History]]]  # environment -> agent -> its runs
@@ -134,8 +135,8 @@ def _has_band(curves: list[Line]) -> bool:
 def _named(agent: str, groups: Groups, by: Axis) -> str:
     drawn = [by_agent[agent] for by_agent in groups.values() if agent in by_agent]
     fewest, most = min(map(len, drawn)), max(map(len, drawn))
-    banded = all(_has_band([curve(run, by) for run in runs]) for runs in drawn)
-    how = "interquartile mean, 95 %" if banded else "each a line"
+    banded = [_has_band([curve(run, by) for run in runs]) for runs in drawn]
+    how = " or ".join(["each a line"] * (not all(banded)) + ["interquartile mean, 95 %"] * any(banded))
     seeds = f"{fewest}" if fewest == most else f"{fewest} to {most}"
     return f"{agent} ({seeds} seed{'s' * (most > 1)}, {how})"
 
@@ -156,7 +157,10 @@ def tables(groups: Groups, reference: str | None) -> list[Table]:
 def _table(env: str, by_agent: dict[str, list[History]], reference: str | None) -> Table:
     table = Table(title=env, title_justify="left", box=None, pad_edge=False)
     for name in [*HEADINGS, *(["scaled", "P(better)"] if reference else [])]:
-        table.add_column(name, justify="left" if name == "agent" else "right", no_wrap=name != "agent")
+        if name == "agent":
+            table.add_column(name, max_width=AGENT_WIDTH)
+        else:
+            table.add_column(name, justify="right", no_wrap=True)
     for agent, runs in by_agent.items():
         table.add_row(agent, *cells(runs), *(_beside(runs, by_agent.get(reference, [])) if reference else []))
     return table

@@ -206,24 +206,42 @@ def _env_label(env: EnvConfig) -> str:
 
 def _evaluations(records: Iterable[dict[str, Any]]) -> list[Evaluation]:
     """In order of agent steps. A run that went back to an earlier checkpoint has lost what it made after it."""
-    steps, walls, played = {}, {}, []  # all that is kept of what a long run has said
+    steps, said = {}, []  # all that is kept of a long run
     for record in records:
         if _says(record, "learner", "updates", "env_steps"):
             steps[record["updates"]] = record["env_steps"]
         elif _says(record, "launcher", "time", "wall_s"):
-            walls[record["time"]] = record["wall_s"]
+            said.append({name: record[name] for name in ("role", "time", "wall_s")})
         elif _says(record, "evaluator", "time", "eval_update", "eval_return_mean", "eval_return_std"):
-            played.append(record)
+            said.append(record)
     evaluations: list[Evaluation] = []
-    times = _between([record["time"] for record in played], walls)
-    places = _between([record["eval_update"] for record in played], steps)
-    for record, wall, place in zip(played, times, places, strict=True):
+    played = [(record, wall) for record, wall in zip(said, wall_seconds(said), strict=True) if "wall_s" not in record]
+    places = _between([record["eval_update"] for record, _ in played], steps)
+    for (record, wall), place in zip(played, places, strict=True):
         updates, own = record["eval_update"], _says(record, "evaluator", "eval_env_steps")
         at = int(record["eval_env_steps"] if own else place)  # older runs say the update alone
         while evaluations and evaluations[-1].env_steps >= at:
             evaluations.pop()
         evaluations.append(Evaluation(at, updates, wall, record["eval_return_mean"], record["eval_return_std"]))
     return evaluations
+
+
+def wall_seconds(records: Sequence[dict[str, Any]]) -> list[float]:
+    """Seconds trained when each was written, over all starts, by what the launcher says before and after it.
+
+    Not by time alone: a clock may go back between two starts. ``records``, each with a ``time``, are in the file's
+    order, in which one may come a moment late.
+    """
+    known = [(one["time"], one["wall_s"]) for one in records if _says(one, "launcher", "time", "wall_s")] or [
+        (0.0, 0.0)
+    ]
+    seconds, before = [], 0
+    for record in records:
+        before += _says(record, "launcher", "time", "wall_s")
+        time, wall = known[max(before - 1, 0)]
+        least, most = known[before - 2][1] if before > 1 else 0.0, known[min(before, len(known) - 1)][1]
+        seconds.append(min(max(least, wall + record["time"] - time), most))
+    return seconds
 
 
 def _says(record: dict[str, Any], role: str, *names: str) -> bool:

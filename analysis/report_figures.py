@@ -109,7 +109,7 @@ def _bins(x: NDArray[np.float64], count: int) -> NDArray[np.int64]:
 
 def waits(run: ReportRun) -> str | None:
     """Who worked and who waited for what over wall time, a strip for each kind of role."""
-    walls = np.array(run.wall_seconds([record["time"] for record in run.records]))
+    walls = np.array([record["trained_s"] for record in run.records])
     if not len(walls):
         return None
     longest = float(walls.max() - walls.min())

@@ -6,8 +6,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from rmc.analysis import history
 from rmc.analysis.doctor import examine
 from rmc.analysis.history import About, History
@@ -49,6 +47,8 @@ class ReportRun:
         about = history.describe(path)
         timed = (record for record in folder.records() if is_finite(record.get("time")))
         records = [{name: one[name] for name in DRAWN if name in one} for one in timed]  # no names of their own
+        for record, seconds in zip(records, history.wall_seconds(records), strict=True):
+            record["trained_s"] = seconds
         try:
             past = history.of_run(folder)
         except ConfigError:
@@ -86,22 +86,7 @@ class ReportRun:
         of_kind = (record for record in self.records if record["role"].partition("-")[0] == kind)
         said = [record for record in of_kind if is_finite(record.get(name))]
         shares = self.options.get("replay.replay_shards", 1) if name == "env_steps_per_s" else 1
-        return self.wall_seconds([one["time"] for one in said]), [float(shares * one[name]) for one in said]
-
-    def wall_seconds(self, times: list[float]) -> list[float]:
-        """Seconds trained at these times, over all starts of the run."""
-        wall_times = [
-            (record["time"], record["wall_s"])
-            for record in self.records
-            if record["role"] == "launcher" and is_finite(record.get("wall_s"))
-        ]
-        if not wall_times:
-            return [0.0] * len(times)
-        began, wall = wall_times[0]
-        seconds = np.interp(times, [at for at, _ in wall_times], [seconds for _, seconds in wall_times])
-        return [
-            max(0.0, wall - (began - at)) if at < began else float(one) for at, one in zip(times, seconds, strict=True)
-        ]
+        return [one["trained_s"] for one in said], [float(shares * one[name]) for one in said]
 
 
 def told_apart(runs: Sequence[ReportRun]) -> list[ReportRun]:

@@ -82,7 +82,7 @@ def empty_status(folder: RunFolder, expected: tuple[str, ...] = ()) -> RunStatus
     status = RunStatus(env, preset, seed, total, ratio, expected)
     status.steps_before = max((start.env_steps for start in starts(folder)[-1:]), default=0)
     if folder.is_baseline():
-        status.heard = "launcher"
+        status.heard, status.steps_before = "launcher", 0  # a killed one goes on from long before
     return status
 
 

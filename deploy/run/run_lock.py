@@ -30,8 +30,11 @@ class RunLock:
         self._locked_folder: os.stat_result | None = None
         self._before = ""  # what the last launcher has left in it
 
-    def take(self) -> None:
-        """Be the one launcher of this run. Raises ConfigError where another one is, or the folder cannot be written."""
+    def take(self, elsewhere: str = "") -> None:
+        """Be the one launcher of this run; ``elsewhere`` is where it trains, if not in this process's place.
+
+        Raises ConfigError where another one is, or the folder cannot be written.
+        """
         self.check_untrained()
         try:
             self._handle = take_lock(self._file, LOCK_SECONDS)
@@ -44,7 +47,7 @@ class RunLock:
             raise self._is_trained()
         self._locked_folder, self._before = self._folder.stat(), self._file.read_text(errors="replace")
         try:
-            self._note(" ".join(["training", str(os.getpid()), *_process_space()]))
+            self._note(" ".join(["training", str(os.getpid()), *([elsewhere] if elsewhere else _process_space())]))
         except BaseException:  # a full disk; a notebook would keep the lock
             self.give_back()
             raise

@@ -22,7 +22,7 @@ class Index:
 
     def __init__(self, folder: Path) -> None:
         """Raises ConfigError where another sweep runs in it, or it cannot be made or read."""
-        self._path = folder / NAME
+        self.folder, self._path = folder, folder / NAME
         try:
             folder.mkdir(parents=True, exist_ok=True)
             self._lock = take_lock(folder / ".lock", patience=0.0)

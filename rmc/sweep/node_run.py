@@ -18,14 +18,15 @@ BEGIN_SECONDS = 60.0
 class NodeRun:
     """``rmc train`` in a folder of the node that goes with it. Ends with the sweep."""
 
-    def __init__(self, words: tuple[str, ...], name: str, brought: Parcel, working_folder: str) -> None:
+    def __init__(self, words: tuple[str, ...], home: Path, brought: Parcel, working_folder: str) -> None:
+        """``home`` is the run's folder on the machine of the sweep, as its log calls it."""
         leave_rays_worker(working_folder)
         base = private_folder(Path(tempfile.gettempdir()) / f"rmc-sweep-{os.getuid()}")
         for folder in filter(_is_abandoned, base.iterdir()):
             shutil.rmtree(folder, ignore_errors=True)
         self._place = Path(tempfile.mkdtemp(dir=base))
         self._lock = take_lock(self._place / "lock")
-        self._folder, self._log = self._place / name, self._place / "log"
+        self._home, self._folder, self._log = home, self._place / home.name, self._place / "log"
         if brought.stamps:
             unpack(brought, self._folder, {})
         self._process = spawn([*words, "--run-dir", str(self._folder)], self._log)
@@ -38,7 +39,8 @@ class NodeRun:
         status = self._process.poll()
         if status is None and not copy:
             return None, None, b""
-        parcel, log = pack(self._folder, stamps), self._log.read_bytes()
+        log = self._log.read_bytes().replace(os.fsencode(self._folder), os.fsencode(self._home))
+        parcel = pack(self._folder, stamps)
         if status is not None:
             shutil.rmtree(self._place, ignore_errors=True)
         return status, parcel, log

@@ -44,19 +44,13 @@ def pack(folder: Path, stamps: Stamps) -> Parcel:
 
 
 def _sent(folder: Path) -> Iterator[Path]:
-    """What is below it, but for rings, links, and the lock of who trains there: that process is not here."""
+    """What is below it, but for rings, links, and its lock, which is of that machine."""
     for place, folders, files in os.walk(folder):  # which leaves out what vanishes
         if Path(place) == folder:
             folders[:] = [name for name in folders if not RING.fullmatch(name)]
         for path in (Path(place) / name for name in sorted((*folders, *files))):
-            if not (path.is_symlink() or (path == folder / ".lock" and _trains(path))):
+            if not (path.is_symlink() or path == folder / ".lock"):
                 yield path
-
-
-def _trains(lock: Path) -> bool:
-    with suppress(FileNotFoundError):
-        return lock.read_bytes().startswith(b"training")
-    return False
 
 
 def unpack(parcel: Parcel, folder: Path, before: Stamps) -> None:

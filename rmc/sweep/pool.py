@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal, Protocol
 
 from rmc.common.checkpoint import CheckpointFolder
-from rmc.common.errors import STOPPED_STATUS
+from rmc.common.errors import STOPPED_STATUS, ConfigError
 from rmc.common.process.role import StopSignal
 from rmc.deploy.monitor.attach import STOP_SECONDS
 from rmc.deploy.run.folder import RunFolder
@@ -50,7 +50,7 @@ class Place(Protocol):
         """Whether another one fits now."""
 
     def start(self, job: Job) -> Run:
-        """Start one; it continues from what its folder has."""
+        """Start one; it continues from what its folder has. Raises ConfigError where somebody else trains it."""
 
 
 class SweepPlan(Protocol):
@@ -99,11 +99,19 @@ def conduct(
 ) -> None:
     """Run all of a plan; with a stop signal no other one starts, and those at work end cleanly."""
     at_work: list[_AtWork] = []
+
+    def over(job: Job, ending: Ending) -> None:
+        plan.end(job, ending)
+        ended(job, ending)
+
     try:
         while True:
             while not stop.requested and place.has_room() and (job := plan.next()) is not None:
                 begun(job)
-                at_work.append(_AtWork(job, place.start(job), time.monotonic()))
+                try:
+                    at_work.append(_AtWork(job, place.start(job), time.monotonic()))
+                except ConfigError as error:
+                    over(job, Ending("failed", 0.0, str(error)))
             if not at_work:
                 return
             for one in list(at_work):
@@ -113,9 +121,7 @@ def conduct(
                 status = one.run.status()
                 if status is not None:
                     at_work.remove(one)
-                    ending = one.ending(status)
-                    plan.end(one.job, ending)
-                    ended(one.job, ending)
+                    over(one.job, one.ending(status))
             time.sleep(LOOK_SECONDS)
     finally:
         _end(at_work)  # only where an error ends the sweep itself

@@ -9,6 +9,8 @@ import ray
 
 from rmc.common.errors import ConfigError, last_line
 from rmc.common.whole_file import NO_ROOM, write_whole
+from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.run_lock import RunLock
 from rmc.sweep.job import Job
 from rmc.sweep.local_runs import last_log_line
 from rmc.sweep.node_run import NodeRun
@@ -48,9 +50,12 @@ class RayRuns:
         return self._running == 0 or self._running < self.capacity()
 
     def start(self, job: Job) -> "RayRun":
-        """Ask for a node, and send it what the job's folder has."""
+        """Ask for a node, and send it what the job's folder has. Raises ConfigError where somebody trains it."""
+        lock = RunFolder(job.folder).lock
+        job.folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        lock.take(elsewhere="Ray")
         self._running += 1
-        return RayRun(self, job, self._needs)
+        return RayRun(self, job, self._needs, lock)
 
     def release(self) -> None:
         """One has ended."""
@@ -60,11 +65,11 @@ class RayRuns:
 class RayRun:
     """A run on some node, whose files are copied here again and again; nothing here waits for the node."""
 
-    def __init__(self, runs: RayRuns, job: Job, needs: dict[str, Any]) -> None:
-        self._runs, self._job, self._lost = runs, job, ""
+    def __init__(self, runs: RayRuns, job: Job, needs: dict[str, Any], lock: RunLock) -> None:
+        self._runs, self._job, self._lost, self._lock = runs, job, "", lock
         self._log = job.log.read_bytes() if job.log.exists() else b""
-        brought = pack(job.folder, {}) if job.folder.exists() else Parcel()
-        self._actor = ray.remote(NodeRun).options(**needs).remote(job.words, job.name, brought, os.getcwd())
+        brought = pack(job.folder, {})
+        self._actor = ray.remote(NodeRun).options(**needs).remote(job.words, job.folder, brought, os.getcwd())
         self._stamps: Stamps = brought.stamps  # of its files, those that are here
         self._pending: Any = self._actor.look.remote(self._stamps, True)
         self._begun, self._look_at, self._copy_at = False, 0.0, 0.0
@@ -102,6 +107,7 @@ class RayRun:
     def _end(self, status: int) -> int:
         ray.kill(self._actor)
         self._runs.release()
+        self._lock.release(status)
         return status
 
     def stop(self) -> None:

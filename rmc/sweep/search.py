@@ -17,7 +17,7 @@ from rmc.analysis.history import Evaluation, of_run
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.metrics_tail import MetricsTail
-from rmc.sweep.index import Index
+from rmc.sweep.index import NAME, Index
 from rmc.sweep.job import TRIAL, Job
 from rmc.sweep.pool import Ending
 from rmc.sweep.spec import Range, Search
@@ -39,7 +39,10 @@ class SearchPlan:
         is_finished: Callable[[Job], bool],
         checkpoint_steps: int,
     ) -> None:
-        """``make`` gives a trial's run by its name and values. Raises ConfigError where the index has other ranges."""
+        """``make`` gives a trial's run by its name and values.
+
+        Raises ConfigError where the index has other ranges, or lacks a trial whose folder is there.
+        """
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         self._search, self._distributions, self._make = search, dict(distributions), make
         self._is_finished = is_finished
@@ -51,6 +54,14 @@ class SearchPlan:
         self._index = index
         self.jobs = [self._earlier_job(line) for name, line in index.lines.items() if name.startswith(TRIAL)]
         self._names = self._all_names()
+        self._check_folders()
+
+    def _check_folders(self) -> None:
+        """Raises ConfigError where a trial's folder is there without its line: a new one would go on in it."""
+        for name in (f"{TRIAL}{number}" for number in range(self._search.trials)):
+            if name not in self._index.lines and (self._index.folder / name / "config.json").exists():
+                fix = f"{NAME} has no line of it, so a new trial would go on in it; move it away"
+                raise ConfigError("--sweep-dir", str(self._index.folder / name), fix)
 
     def _earlier_job(self, line: dict[str, Any]) -> Job:
         """Tell Optuna of a trial of before, or take it up again."""

@@ -6,6 +6,7 @@ import pickle
 import re
 import shutil
 import subprocess
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import get_args
@@ -27,10 +28,12 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.env.process_state import _random_state
 from rmc.common.errors import ConfigError
 from rmc.common.process.role import StopSignal
+from rmc.deploy.monitor.recorded import recorded_status
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.metrics_tail import wall_seconds
 from rmc.deploy.run.migrations import FORMAT
-from rmc.deploy.run.starts import starts
+from rmc.deploy.run.starts import note_start, starts
 from tests import habits
 from tests.command import COMMAND
 
@@ -212,6 +215,14 @@ def test_another_agent_is_not_gone_on_with(tmp_path):
         run(config(), tmp_path / "other")
     with pytest.raises(ConfigError, match="cannot be made"):
         run(config(), Path("/etc/passwd/x"))
+
+
+def test_one_that_was_killed_has_the_steps_that_it_went_back_to(finished, tmp_path):
+    folder = RunFolder(shutil.copytree(finished, tmp_path / "run"))
+    note_start(folder, {}, LaunchOptions(), None)  # at 200 steps
+    with folder.metrics.open("a") as file:
+        file.write(json.dumps({"role": "learner", "time": time.time(), "env_steps": 7, "updates": 3}) + "\n")
+    assert recorded_status(folder).env_steps == 7
 
 
 def test_a_stack_of_frames_belongs_to_the_agent(tmp_path):

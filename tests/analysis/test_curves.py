@@ -34,6 +34,25 @@ def shown(tables) -> str:
     return text.get()
 
 
+def test_an_evaluation_has_its_seconds_where_the_clock_went_back():
+    times = [(100.0, 5.0), (200.0, 105.0), (20.0, 105.0), (120.0, 205.0)]  # the second start's is behind
+    records = [{"role": "launcher", "time": time, "wall_s": wall} for time, wall in times]
+    for place, time in ((1, 150.0), (3, 199.0), (5, 70.0), (7, 121.0)):
+        records.insert(place, {"role": "evaluator", "time": time})
+    assert history.wall_seconds(records)[1::2] == [55.0, 104.0, 155.0, 205.0]
+    assert history.wall_seconds([{"role": "actor-0", "time": 7.0}]) == [0.0]
+
+
+def test_a_table_in_a_pipe_has_every_name_and_digit(tmp_path, capsys):
+    runs = [history_of(agent, seed=seed, last=12_345.0) for agent in ("RMC", "RMC --gamma 0.95") for seed in range(4)]
+    (tmp_path / "lines").write_text("\n".join(run.to_line() for run in runs))
+    assert run(["plot", str(tmp_path / "lines"), "--reference", "RMC", "--out", str(tmp_path / "a.png")]) == 0
+    shown = capsys.readouterr().out
+    assert "RMC --gamma 0.95" in shown
+    assert "12,345 (12,345, 12,345, 12,345, 12,345)" in shown
+    assert "\N{HORIZONTAL ELLIPSIS}" not in shown
+
+
 def test_a_line_holds_a_history():
     line = history_of().to_line()
     assert history._of_line(json.loads(line), "file:1").to_line() == line
@@ -94,7 +113,8 @@ def test_a_week_of_evaluations_is_read_at_once(tmp_path: Path) -> None:
     launcher = [{"role": "launcher", "time": 5.0 * at, "wall_s": 2.5 * at} for at in range(12 * len(minutes) + 1)]
     said = {"role": "evaluator", "eval_return_mean": 1.0, "eval_return_std": 0.0}
     played = [said | {"time": 60.0 * at, "eval_update": at, "eval_env_steps": at} for at in minutes]
-    (tmp_path / "metrics.jsonl").write_text("".join(f"{json.dumps(line)}\n" for line in launcher + played))
+    lines = sorted(launcher + played, key=lambda line: line["time"])  # the launcher's first, as sorting is stable
+    (tmp_path / "metrics.jsonl").write_text("".join(f"{json.dumps(line)}\n" for line in lines))
     (past,) = history.read_histories(tmp_path)
     assert [(one.env_steps, one.wall_s) for one in past.evaluations] == [(at, 30.0 * at) for at in minutes]
 
@@ -446,6 +466,7 @@ def test_bad_input_is_one_line_that_names_the_fault(words, fault, tmp_path, caps
         ((1,), "1 seed, each a line"),
         ((3, 1), "1 to 3 seeds, each a line"),
         ((5, 5), "5 seeds, interquartile mean, 95 %"),
+        ((5, 3), "3 to 5 seeds, each a line or interquartile mean, 95 %"),
     ],
 )
 def test_the_legend_says_how_many_seeds_its_panels_have(counts, label):

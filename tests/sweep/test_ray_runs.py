@@ -17,12 +17,14 @@ from rmc.cli import main, parser, sweep_command
 from rmc.cli.sweep_command import Work
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.state import run_state
 from rmc.sweep import ray_runs
 from rmc.sweep.job import Job
 from rmc.sweep.node_run import _is_abandoned
 from rmc.sweep.parcel import pack, unpack
 from rmc.sweep.ray_runs import RayRun, RayRuns
 from tests.cluster.test_ray import leaves_nothing_behind
+from tests.command import complaint
 from tests.sweep.sweeping import ENDLESS, PENDULUM, Sweeping, write_spec
 
 assert leaves_nothing_behind  # Ray keeps a few files of its own
@@ -53,14 +55,20 @@ def test_runs_are_spread_and_their_folders_come_without_the_ring(tmp_path: Path)
 
 @pytest.mark.long
 @pytest.mark.timeout(300)
-def test_a_stopped_and_a_lost_run_go_on_with_the_same_command(tmp_path: Path) -> None:
+def test_a_stopped_and_a_lost_run_go_on_with_the_same_command(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder, spec = tmp_path / "sweep", str(write_spec(tmp_path, **ENDLESS))
     with Sweeping(folder, spec, *RAY) as sweep:
         sweep.wait_for_updates("seed=0")
+        run = RunFolder(folder / "seed=0")
+        assert run_state(run) == "training"
+        assert "this run is being trained; stop it first" in complaint(["resume", str(run.path)], capsys)
+        assert "is trained on Ray; stop it there" in complaint(["stop", str(run.path)], capsys)
         assert sweep.interrupt() == 130
     assert sweep.states() == {"seed=0": "stopped"}
-    run = RunFolder(folder / "seed=0")
     assert run.lock.ended() == 130
+    assert f"rmc resume {run.path}" in (folder / "logs" / "seed=0.log").read_text()
     saved = sorted(path.name for path in run.checkpoints.glob("[0-9]*"))
     assert saved
     with Sweeping(folder, spec, *RAY) as sweep:
@@ -132,14 +140,22 @@ def test_a_copy_is_like_the_folder_and_only_what_changed_is_sent(tmp_path: Path)
     assert pack(source, later.stamps).files == {}
 
 
-def test_the_lock_of_who_trains_there_and_no_ring_is_sent(tmp_path: Path) -> None:
+def test_a_run_that_is_trained_by_hand_is_not_sent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    nodes = [{"Alive": True, "Resources": {"CPU": 2.0, "memory": 8e9}}]
+    monkeypatch.setattr(ray_runs.ray, "nodes", lambda: nodes)
+    by_hand = RunFolder(tmp_path).lock
+    by_hand.take()
+    with pytest.raises(ConfigError, match="this run is being trained; stop it first"):
+        RayRuns(1, 1_000, 0, 0).start(Job(tmp_path, ("train", PENDULUM), 0))
+    by_hand.release()
+
+
+def test_neither_the_lock_nor_a_ring_is_sent(tmp_path: Path) -> None:
     (tmp_path / "replay-0").mkdir()
     (tmp_path / "replay-0" / "ring").touch()
-    lock = tmp_path / ".lock"
-    lock.write_text("training 7 node")
-    assert pack(tmp_path, {}).stamps == {}
-    lock.write_text("ended 0")
-    assert list(pack(tmp_path, {}).stamps) == [".lock"]
+    (tmp_path / ".lock").write_text("ended 0")
+    (tmp_path / "config.json").touch()
+    assert list(pack(tmp_path, {}).stamps) == ["config.json"]
 
 
 def test_a_kill_while_a_copy_is_written_leaves_the_one_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

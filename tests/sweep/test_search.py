@@ -172,6 +172,14 @@ def test_other_ranges_than_those_of_its_trials_are_refused(tmp_path: Path, index
             work_of(tmp_path, index, spec)
 
 
+def test_a_trials_folder_without_its_line_is_not_gone_on_with(tmp_path: Path, index: Index) -> None:
+    """As where a damaged line was removed by hand: its networks would count for other values."""
+    play(work_of(tmp_path, index, spec_of()), index, [1.0] * 4)
+    del index.lines["trial-0"]
+    with pytest.raises(ConfigError, match=r"trial-0: sweep.jsonl has no line of it, .*; move it away"):
+        work_of(tmp_path, index, spec_of())
+
+
 def test_a_search_that_goes_on_has_the_options_of_its_trials(tmp_path: Path, index: Index) -> None:
     work = work_of(tmp_path, index, spec_of())
     play(work, index, [1.0] * 4, finished=False)

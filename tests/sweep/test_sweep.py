@@ -155,6 +155,13 @@ def test_ctrl_c_ends_all_in_order_and_a_kill_leaves_nothing(tmp_path: Path) -> N
         wait_until(lambda: not alive(processes), said=lambda: alive(processes))
 
 
+class Ended(SimpleNamespace):
+    """A run that is over."""
+
+    def status(self) -> int | None:
+        return 0
+
+
 class Saving:
     """A run that needs a moment to save once it is asked to end."""
 
@@ -192,6 +199,27 @@ def test_a_full_disk_ends_a_sweep_but_its_runs_save_first(tmp_path: Path, monkey
     assert at_work[0].done[0] == "stop"
     assert "kill" not in at_work[0].done
     assert at_work[1].done == []
+
+
+def test_one_that_cannot_be_started_fails_alone(tmp_path: Path) -> None:
+    jobs, endings = [Job(tmp_path / f"seed={seed}", ("train", "Pendulum-v1"), seed) for seed in SEEDS], {}
+
+    def start(job: Job) -> Ended:
+        if job.seed == 1:
+            raise ConfigError("--run-dir", str(job.folder), "this run is being trained")
+        return Ended()
+
+    plan = SimpleNamespace(next=lambda: jobs.pop(0) if jobs else None, is_hopeless=lambda _: False, end=lambda *_: None)
+    place = SimpleNamespace(has_room=lambda: True, start=start)
+    pool.conduct(
+        cast(Any, plan),
+        cast(Any, place),
+        StopSignal(),
+        lambda _: None,
+        lambda job, how: endings.update({job.seed: how}),
+    )
+    assert {seed: ending.state for seed, ending in endings.items()} == {1: "failed", 2: "finished"}
+    assert "this run is being trained" in endings[1].reason
 
 
 def test_one_that_does_not_end_in_time_is_killed(tmp_path: Path) -> None:
