@@ -219,6 +219,7 @@ def test_another_agent_is_not_gone_on_with(tmp_path):
 
 def test_one_that_was_killed_has_the_steps_that_it_went_back_to(finished, tmp_path):
     folder = RunFolder(shutil.copytree(finished, tmp_path / "run"))
+    (folder.path / "result.json").unlink()
     note_start(folder, {}, LaunchOptions(), None)  # at 200 steps
     with folder.metrics.open("a") as file:
         file.write(json.dumps({"role": "learner", "time": time.time(), "env_steps": 7, "updates": 3}) + "\n")

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -96,11 +97,14 @@ def test_values_are_drawn_from_the_ranges_and_a_search_that_goes_on_draws_what_i
     assert [job.name for job in work.jobs] == [f"trial-{number}" for number in range(6)]
 
     for job in rest:
+        shutil.rmtree(job.folder)
         del index.lines[job.name]
     again = work_of(tmp_path, index, spec_of(6))
     assert [job.name for job in again.todo] == ["trial-3", "trial-4", "trial-5"]
     assert [play(again, index, [float(at)] * 4).values for at in range(3, 6)] == values[3:]
     index.lines.clear()
+    for job in [*first, *rest]:
+        shutil.rmtree(job.folder)
     other = work_of(tmp_path, index, spec_of(6, sampler_seed=1))
     assert all(other.plan.next().values not in values for _ in range(5))  # a neighbour's draws are no repetition
 
@@ -176,7 +180,7 @@ def test_a_trials_folder_without_its_line_is_not_gone_on_with(tmp_path: Path, in
     """As where a damaged line was removed by hand: its networks would count for other values."""
     play(work_of(tmp_path, index, spec_of()), index, [1.0] * 4)
     del index.lines["trial-0"]
-    with pytest.raises(ConfigError, match=r"trial-0: sweep.jsonl has no line of it, .*; move it away"):
+    with pytest.raises(ConfigError, match=r"trial-0': sweep.jsonl has no line of it, .*; move it away"):
         work_of(tmp_path, index, spec_of())
 
 
