@@ -15,6 +15,7 @@ from rmc.deploy.monitor.recorded import Callback, catch_up, empty_status, take_s
 from rmc.deploy.monitor.view import View
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.metrics_tail import MetricsTail
+from rmc.deploy.run.run_lock import ON_RAY
 from rmc.deploy.run.starts import last_launch, resume_command
 from rmc.deploy.run.state import run_state
 
@@ -94,7 +95,8 @@ def stop(folder: RunFolder) -> None:
     """Ask the launcher to end the run cleanly, and wait until it has. Raises ConfigError."""
     trainer = launcher_pid(folder)
     if elsewhere := folder.lock.trained_elsewhere():
-        raise ConfigError("RUN", str(folder.path), f"is trained on {elsewhere}; stop it there")
+        there = "its sweep" if elsewhere == ON_RAY else "it there"
+        raise ConfigError("RUN", str(folder.path), f"is trained on {elsewhere}; stop {there}")
     _ask(folder, trainer)
     seconds = STOP_SECONDS + CheckpointFolder(folder.checkpoints).patience(0.0)
     deadline = time.monotonic() + seconds

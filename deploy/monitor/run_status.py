@@ -52,7 +52,7 @@ class RunStatus:
         self.best: EvaluationStatus | None = None
         self.final_steps: int | None = None  # once the run has its result
         self.is_past = False  # whether newer words are there, and not taken in yet
-        self.heard = "*"  # which roles speak all the time; of a baseline the launcher alone
+        self.heard = "*"  # which roles speak all the time; of a baseline the launcher alone, of a copy none
         self._pace = Pace()
         self._checkpoints: dict[int, int] = {}  # agent steps by update
         self._counted, self._moved_at, self._spoke_at = (0, 0), 0.0, 0.0  # steps and updates, when they last grew

@@ -1,6 +1,7 @@
 """The lock of a run's folder: which launcher trains the run, where, and how the last one ended.
 
-``.lock`` holds ``training PID MACHINE CONTAINER BOOT`` while a launcher trains the run, then ``ended STATUS``.
+``.lock`` holds ``training PID MACHINE CONTAINER BOOT`` while a launcher trains the run, then ``ended STATUS``. Where a
+sweep's run is on some node of Ray, it holds ``training PID Ray``, with the sweep's process.
 """
 
 import errno
@@ -18,6 +19,7 @@ from rmc.common.process.file_lock import WITHOUT_LOCKS, release_lock, take_lock,
 
 BOOT = Path("/proc/sys/kernel/random/boot_id")  # no two machines have one
 PROCESS = re.compile("[1-9][0-9]{0,8}")  # a signal to 0 or -1 would reach many
+ON_RAY = "Ray"
 LOCK_SECONDS = 1.0  # others look, now and then, whether the folder is locked
 
 

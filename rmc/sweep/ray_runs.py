@@ -10,7 +10,7 @@ import ray
 from rmc.common.errors import ConfigError, last_line
 from rmc.common.whole_file import NO_ROOM, write_whole
 from rmc.deploy.run.folder import RunFolder
-from rmc.deploy.run.run_lock import RunLock
+from rmc.deploy.run.run_lock import ON_RAY, RunLock
 from rmc.sweep.job import Job
 from rmc.sweep.local_runs import last_log_line
 from rmc.sweep.node_run import NodeRun
@@ -53,7 +53,7 @@ class RayRuns:
         """Ask for a node, and send it what the job's folder has. Raises ConfigError where somebody trains it."""
         lock = RunFolder(job.folder).lock
         job.folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-        lock.take(elsewhere="Ray")
+        lock.take(elsewhere=ON_RAY)
         self._running += 1
         return RayRun(self, job, self._needs, lock)
 
@@ -107,7 +107,7 @@ class RayRun:
     def _end(self, status: int) -> int:
         ray.kill(self._actor)
         self._runs.release()
-        self._lock.release(status)
+        self._lock.release(None if self._lost else status)
         return status
 
     def stop(self) -> None:

@@ -23,6 +23,7 @@ from rmc.deploy.monitor.notices import notices
 from rmc.deploy.monitor.recorded import empty_status, recorded_status, take_start
 from rmc.deploy.run.folder import RESULT, RunFolder
 from rmc.deploy.run.launch_options import Launcher, LaunchOptions
+from rmc.deploy.run.run_lock import ON_RAY
 from rmc.deploy.run.starts import note_start
 
 HOLDER = """
@@ -105,6 +106,21 @@ def test_a_trainer_on_another_machine_is_not_ours_to_stop(folder: RunFolder, mon
     monkeypatch.setattr("rmc.deploy.run.run_lock.BOOT", folder.path / "config.json")
     with pytest.raises(ConfigError, match=r"is trained on .*; stop it there"):
         stop(folder)
+    folder.lock.release()
+
+
+def test_nor_is_a_sweeps_run_on_ray_whose_roles_are_silent_between_copies(folder: RunFolder) -> None:
+    begun(folder, 60.0)
+    said = [{"role": role, "time": time.time() - 20.0, "start_s": 40.0} for role in ("launcher", "learner")]
+    folder.metrics.write_text("".join(json.dumps(one) + "\n" for one in said))
+    folder.lock.take(elsewhere=ON_RAY)
+    with pytest.raises(ConfigError, match="is trained on Ray; stop its sweep"):
+        stop(folder)
+    assert recorded_status(folder).state == "training"
+    assert "silent" not in notices(recorded_status(folder))
+    folder.lock.release()
+    folder.lock.take()
+    assert "silent" in notices(recorded_status(folder))
     folder.lock.release()
 
 

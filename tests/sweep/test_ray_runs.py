@@ -64,7 +64,7 @@ def test_a_stopped_and_a_lost_run_go_on_with_the_same_command(
         run = RunFolder(folder / "seed=0")
         assert run_state(run) == "training"
         assert "this run is being trained; stop it first" in complaint(["resume", str(run.path)], capsys)
-        assert "is trained on Ray; stop it there" in complaint(["stop", str(run.path)], capsys)
+        assert "is trained on Ray; stop its sweep" in complaint(["stop", str(run.path)], capsys)
         assert sweep.interrupt() == 130
     assert sweep.states() == {"seed=0": "stopped"}
     assert run.lock.ended() == 130
@@ -82,6 +82,7 @@ def test_a_stopped_and_a_lost_run_go_on_with_the_same_command(
     assert "without their replay ring, these continue" in sweep.text()
     assert sweep.lines()["seed=0"]["state"] == "failed"
     assert "its node was lost" in sweep.lines()["seed=0"]["reason"]
+    assert run_state(run) == "stopped"
     assert sweep.text().count("its node was lost") == 1
 
 
