@@ -15,7 +15,6 @@ from rmc.deploy.monitor.recorded import Callback, catch_up, empty_status, take_s
 from rmc.deploy.monitor.view import View
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.metrics_tail import MetricsTail
-from rmc.deploy.run.run_lock import ON_RAY
 from rmc.deploy.run.starts import last_launch, resume_command
 from rmc.deploy.run.state import run_state
 
@@ -95,7 +94,7 @@ def stop(folder: RunFolder) -> None:
     """Ask the launcher to end the run cleanly, and wait until it has. Raises ConfigError."""
     trainer = launcher_pid(folder)
     if elsewhere := folder.lock.trained_elsewhere():
-        there = "its sweep" if elsewhere == ON_RAY else "it there"
+        there = "its sweep" if folder.lock.is_on_ray() else "it there"
         raise ConfigError("RUN", str(folder.path), f"is trained on {elsewhere}; stop {there}")
     _ask(folder, trainer)
     seconds = STOP_SECONDS + CheckpointFolder(folder.checkpoints).patience(0.0)

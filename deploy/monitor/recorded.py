@@ -11,7 +11,6 @@ from rmc.deploy.monitor.notices import notices
 from rmc.deploy.monitor.run_status import RunStatus
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.metrics_tail import RECENT_BYTES, MetricsTail
-from rmc.deploy.run.run_lock import ON_RAY
 from rmc.deploy.run.starts import starts
 from rmc.deploy.run.state import run_state
 
@@ -36,7 +35,7 @@ def take_state(status: RunStatus, folder: RunFolder) -> None:
 
 def take_start(status: RunStatus, folder: RunFolder) -> None:
     """Take in when the run was started last: who spoke before need not speak now, nor who speaks on another machine."""
-    if folder.lock.trainer() is not None and folder.lock.trained_elsewhere() == ON_RAY:
+    if folder.lock.is_on_ray():
         status.heard = ""
     status.began = max((start.time for start in starts(folder)[-1:] if is_finite(start.time)), default=0.0)
 

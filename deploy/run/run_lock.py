@@ -128,6 +128,12 @@ class RunLock:
             return ""
         return f"another machine or container called {space[0]}" if space[0] == here[0] else space[0]
 
+    def is_on_ray(self) -> bool:
+        """Whether a sweep trains it on some node of Ray, as far as this user may know."""
+        with suppress(OSError):
+            return self.trainer() is not None and self.trained_elsewhere() == ON_RAY
+        return False
+
     def ended(self) -> int | None:
         """The exit status of the launcher that trained it last, if that came to an end of its own.
 

@@ -195,7 +195,7 @@ def test_a_full_disk_here_is_waited_out(tmp_path: Path, monkeypatch: pytest.Monk
     run, ended = RayRun.__new__(RayRun), []
     run._runs, run._actor = types.SimpleNamespace(release=lambda: ended.append(1)), None  # type: ignore[assignment]
     run._job = Job(tmp_path / "runs" / "one", (), 0, {})
-    run._lock = RunFolder(run._job.folder).lock
+    run._lost, run._lock = "", RunFolder(run._job.folder).lock
     run._log, run._stamps, run._pending, run._look_at = b"", {}, answer, 0.0
     assert run.status() is None
     assert run._pending is answer
