@@ -27,7 +27,6 @@ HEAD = {
 }
 IN_README = {
     "`robust`": "RMC, preset `robust`",
-    "`robust`ᵗ": "RMC, an earlier default with target critics",
     "SAC": "SAC of stable-baselines3, heads of 400 and 300 units",
 }
 
@@ -39,26 +38,26 @@ class Row:
     env: str
     agent: str
     steps: int
-    runs: tuple[tuple[History, str], ...]  # and the mark of each
+    runs: tuple[History, ...]
     public: int | None = None  # SAC's return there
-    beside: str = ""  # what else ran meanwhile
+    beside: bool = False  # another run or tests, so that it took longer
 
     @classmethod
     def of(cls, raw: dict[str, Any]) -> "Row":
         """Raises KeyError where a seed has no line."""
-        runs: list[tuple[History, str]] = []
-        for file, agent, seeds, *mark in raw["runs"]:
+        runs: list[History] = []
+        for file, agent, seeds in raw["runs"]:
             by_seed = {one.seed: one for one in _lines(file) if (one.env, one.agent) == (raw["env"], agent)}
-            runs += [(by_seed[seed], "".join(mark)) for seed in seeds]
+            runs += [by_seed[seed] for seed in seeds]
         return cls(**raw | {"runs": tuple(runs)})
 
     def evaluations(self) -> list[Evaluation]:
         """Each run's, nearest to those steps."""
-        return [min(run.evaluations, key=lambda one: abs(one.env_steps - self.steps)) for run, _ in self.runs]
+        return [min(run.evaluations, key=lambda one: abs(one.env_steps - self.steps)) for run in self.runs]
 
     def seeds(self) -> int:
         """How many there are, one that ran twice counted once."""
-        return len({run.seed for run, _ in self.runs})
+        return len({run.seed for run in self.runs})
 
     def mean(self) -> float:
         """Over runs."""
@@ -87,9 +86,7 @@ def page(path: Path) -> str:
 def _results() -> Iterator[str]:
     for env, own in groupby(rows("returns"), key=lambda row: row.env):
         for number, row in enumerate(own):
-            each = ", ".join(
-                f"{_number(one.return_mean)}{mark}" for one, (_, mark) in zip(row.evaluations(), row.runs, strict=True)
-            )
+            each = ", ".join(_number(one.return_mean) for one in row.evaluations())
             cells = [env if number == 0 else "", row.agent, _number(row.steps), _return(row), each, _seconds(row)]
             yield re.sub(r" +\|", " |", f"| {' | '.join(cells)} | {_number(row.public)} |")
 
@@ -100,27 +97,26 @@ def _readme() -> Iterator[str]:
         if row.agent in IN_README:
             minutes = [round(one.wall_s / 60) for one in row.evaluations()]
             span = " to ".join(dict.fromkeys((str(min(minutes)), str(max(minutes)))))
-            time = f"{span} minutes" + (f", beside {row.beside}" if row.beside else "")
+            time = f"{span} minutes" + (", beside other work" if row.beside else "")
             yield f"| {IN_README[row.agent]} | {len(row.runs)} | {_return(row)} | {time} |"
     public = next(row.public for row in long if row.public is not None)
     yield f"| public SAC on HalfCheetah-v4 | 10 | {_number(public)} | – |"
 
 
 def _return(row: Row) -> str:
-    """Its mean, and deviation over runs; bold where the first row of an agent is ahead of others' first."""
+    """Its mean, and deviation over runs; bold where it is ahead of another agent of two seeds or more."""
     if len(row.runs) == 1:
         return _number(row.mean())
     deviation = statistics.stdev(one.return_mean for one in row.evaluations())
     beside = [one for one in rows("returns") if (one.env, one.steps) == (row.env, row.steps) and one.seeds() > 1]
-    first = {one.agent.split(",")[0].rstrip("ⁿ"): one for one in reversed(beside)}
     text = f"{_number(row.mean())} ± {_number(deviation)}"
-    return f"**{text}**" if len(first) > 1 and row is max(first.values(), key=Row.mean) else text
+    return f"**{text}**" if len(beside) > 1 and row is max(beside, key=Row.mean) else text
 
 
 def _seconds(row: Row) -> str:
     seconds = [one.wall_s for one in row.evaluations()]
     span = " to ".join(dict.fromkeys((_number(min(seconds)), _number(max(seconds)))))
-    return span + (f", beside {row.beside}" if row.beside else "")
+    return span + "*" * row.beside
 
 
 def _number(value: float | None) -> str:
@@ -128,30 +124,34 @@ def _number(value: float | None) -> str:
 
 
 def draw() -> None:
-    """A panel an environment, a line a seed; published figures are crosses."""
+    """A panel an environment, two rows of them, a line a seed; published figures are crosses."""
     from matplotlib.figure import Figure
 
     long = [row for table in ("returns", "half_missing") for row in rows(table) if row.steps >= 300_000]
     panels = {env: list(own) for env, own in groupby(long, key=lambda row: row.env)}
-    figure = Figure(figsize=(3.6 * len(panels), 3.8), layout="constrained")
+    columns = -(-len(panels) // 2)
+    figure = Figure(figsize=(2.9 * columns, 5.6), layout="constrained")
+    places = [figure.add_subplot(2, columns, 1 + place) for place in range(len(panels))]
     handles: dict[str, Any] = {}
-    for axes, (env, own) in zip(figure.subplots(1, len(panels)), panels.items(), strict=True):
+    for axes, (env, own) in zip(places, panels.items(), strict=True):
         for row in own:
             _draw_row(axes, row, handles)
         marks = [(row.steps, row.public) for row in rows("returns") if row.env == env and row.public is not None]
         if marks:
             (handles["public SAC, on -v4"],) = axes.plot(*zip(*marks, strict=True), "x", color="black", markersize=8)
-        axes.set(title=env, xlabel="environment steps", ylabel="return")
+        axes.set(title=env)
         axes.locator_params(axis="x", nbins=4)
         axes.grid(alpha=0.3)
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=5, frameon=False)
+    figure.supxlabel("environment steps")
+    figure.supylabel("return")
+    figure.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=5, frameon=False)
     figure.savefig(PICTURE, dpi=110)
 
 
 def _draw_row(axes: Any, row: Row, handles: dict[str, Any]) -> None:
-    name = row.agent.replace("`", "").rstrip("ⁿ")
+    name = row.agent.split(",")[0].replace("`", "")
     colour = handles[name].get_color() if name in handles else f"C{len(handles)}"
-    for run, _ in row.runs:
+    for run in row.runs:
         points = [(one.env_steps, one.return_mean) for one in run.evaluations]
         (handles[name],) = axes.plot(*zip(*points, strict=True), color=colour, linewidth=1.2, alpha=0.8)
 
