@@ -31,6 +31,7 @@ EPISODES = 5
 LIMIT_SECONDS = 3600.0
 LARGEST_GOAL = 4000.0  # of curves that do not say theirs, too
 PEER = "SBX SAC, 32 updates a call"
+PACE = ("--together", "32", "--starts", "10000", "--episodes", str(EPISODES))  # random steps as in rl-baselines3-zoo
 Point = tuple[float, float]  # seconds since the command, return
 
 
@@ -54,8 +55,8 @@ def ours(env: str, seed: int, every: int) -> Iterator[Point]:
 
 def sbx(python: Path, env: str, seed: int, every: int) -> Iterator[Point]:
     """The same of the peer, which prints a line for each."""
-    began, script = time.time(), str(HERE / "peers" / "sbx_end_to_end.py")
-    process = _started([str(python), script, env, *map(str, (seed, every, EPISODES))])
+    began, script = time.time(), str(HERE / "peers" / "sbx_run.py")
+    process = _started([str(python), script, "SAC", env, str(seed), "--every", str(every), *PACE])
     assert process.stdout is not None
     try:
         for line in process.stdout:

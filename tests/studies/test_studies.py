@@ -18,10 +18,10 @@ from rmc.common.errors import ConfigError
 from rmc.deploy.run.folder import RESULT, RunFolder
 from rmc.deploy.run.validation import validate
 from rmc.sweep.pool import Ending
-from studies import averaging, generalisation, pybullet, study
+from studies import averaging, generalisation, pybullet, sbx, study
 from studies.study import Play, Scale, Study
 
-OTHERS = {"__init__", "drift", "study", "t_maze_env"}
+OTHERS = {"__init__", "drift", "sbx", "study", "t_maze_env"}
 NAMES = sorted({path.stem for path in Path(studies.__file__).parent.glob("*.py")} - OTHERS)
 
 
@@ -249,3 +249,21 @@ def test_pybullets_walkers_stand_beside_what_is_public(tmp_path, monkeypatch, ca
     (tmp_path / "lines").write_text(json.dumps(own))
     pybullet.report(tmp_path / "lines")
     assert "| – | – |" in capsys.readouterr().out
+
+
+def test_a_run_of_sbx_is_one_line(tmp_path, monkeypatch):
+    """What it prints is another's; here a script prints as much in its place."""
+    python = tmp_path / "python"
+    said = '{"steps": 100, "updates": 8, "return": 2.5, "std": 0.5}'
+    python.write_text(f"#!/bin/sh\n[ $4 = 2 ] && exit 1\necho a warning\necho '{said}'\necho $@ >> {tmp_path}/words\n")
+    python.chmod(0o755)
+    monkeypatch.setattr(sbx, "peer_python", lambda _: python)
+    monkeypatch.setattr(sbx, "RESULTS", tmp_path)
+    monkeypatch.setattr("sys.argv", "sbx --env Hopper-v5 --only TD3 --seeds 1 1 2 --steps 100".split())
+    with pytest.raises(subprocess.CalledProcessError):
+        sbx.main()
+    (one,) = history.read_histories(tmp_path / "sbx-100.jsonl")
+    assert (one.agent, one.env, one.seed, one.env_steps, one.finished) == ("TD3 of SBX", "Hopper-v5", 1, 100, True)
+    assert [(past.return_mean, past.return_std) for past in one.evaluations] == [(2.5, 0.5)]
+    (words,) = (tmp_path / "words").read_text().splitlines()
+    assert words.split()[1:] == "TD3 Hopper-v5 1 --steps 100 --every 10000 --together 8 --heads 400 300".split()
