@@ -259,11 +259,12 @@ def test_a_run_of_sbx_is_one_line(tmp_path, monkeypatch):
     python.chmod(0o755)
     monkeypatch.setattr(sbx, "peer_python", lambda _: python)
     monkeypatch.setattr(sbx, "RESULTS", tmp_path)
-    monkeypatch.setattr("sys.argv", "sbx --env Hopper-v5 --only TD3 --seeds 1 1 2 --steps 100".split())
+    asked, told = "TD3 --seeds 1 1 2 --steps 100", "TD3 Hopper-v5 1 --steps 100 --every 10000 --together 8 --heads 400 300"
+    monkeypatch.setattr("sys.argv", ["sbx", "--env", "Hopper-v5", "--only", *asked.split()])
     with pytest.raises(subprocess.CalledProcessError):
         sbx.main()
     (one,) = history.read_histories(tmp_path / "sbx-100.jsonl")
     assert (one.agent, one.env, one.seed, one.env_steps, one.finished) == ("TD3 of SBX", "Hopper-v5", 1, 100, True)
     assert [(past.return_mean, past.return_std) for past in one.evaluations] == [(2.5, 0.5)]
     (words,) = (tmp_path / "words").read_text().splitlines()
-    assert words.split()[1:] == "TD3 Hopper-v5 1 --steps 100 --every 10000 --together 8 --heads 400 300".split()
+    assert words.split()[1:] == told.split()
