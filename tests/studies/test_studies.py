@@ -259,8 +259,9 @@ def test_a_run_of_sbx_is_one_line(tmp_path, monkeypatch):
     python.chmod(0o755)
     monkeypatch.setattr(sbx, "peer_python", lambda _: python)
     monkeypatch.setattr(sbx, "RESULTS", tmp_path)
-    asked, told = "TD3 --seeds 1 1 2 --steps 100", "TD3 Hopper-v5 1 --steps 100 --every 10000 --together 8 --heads 400 300"
-    monkeypatch.setattr("sys.argv", ["sbx", "--env", "Hopper-v5", "--only", *asked.split()])
+    asked = "--env Hopper-v5 --only TD3 --seeds 1 1 2 --steps 100"
+    told = "TD3 Hopper-v5 1 --steps 100 --every 10000 --together 8 --heads 400 300"
+    monkeypatch.setattr("sys.argv", ["sbx", *asked.split()])
     with pytest.raises(subprocess.CalledProcessError):
         sbx.main()
     (one,) = history.read_histories(tmp_path / "sbx-100.jsonl")
