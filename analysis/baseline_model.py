@@ -89,10 +89,19 @@ class BaselineModel:
         return arguments
 
     def save(self, folder: RunFolder) -> None:
-        """Beside the last one, which goes once this is whole; its progress, written last, says that."""
+        """Beside the last one, which goes once this is whole; its progress, written last, says that. Raises OSError."""
         at, before = folder.checkpoints / f"{self.steps:012d}", saved_states(folder)
         if before[-1:] == [at]:
             return
+        try:
+            self._write(at)
+        except OSError:  # no room: what is there of it would take the last one's place on the disk
+            shutil.rmtree(at, ignore_errors=True)
+            raise
+        for old in before:
+            shutil.rmtree(old)
+
+    def _write(self, at: Path) -> None:
         at.mkdir(exist_ok=True)
         self.sb3.save(at / MODEL)
         if self._config.algorithm in OFF_POLICY:
@@ -100,8 +109,6 @@ class BaselineModel:
         if isinstance(self.vec, VecNormalize):
             self.vec.save(str(at / SCALES))
         write_whole(at / PROGRESS, json.dumps({"env_steps": self.steps, "updates": self.updates}).encode())
-        for old in before:
-            shutil.rmtree(old)
 
     def player(self) -> "SB3Adapter":
         """It as it is now."""

@@ -23,15 +23,16 @@ from rmc.actors.evaluator import Rollout, evaluation_record, first_start, play_e
 from rmc.analysis.baseline_model import PROGRESS, BaselineModel, saved_player, saved_states
 from rmc.analysis.baseline_settings import BaselineConfig, read_config, validate
 from rmc.analysis.evaluation import FINAL_EPISODES, EvaluationProgress, Watch, missing_shares
+from rmc.common.bus.metrics_record import is_complete
 from rmc.common.env.make import env_layout, make_env
 from rmc.common.errors import STOPPED_STATUS, ConfigError
 from rmc.common.process.role import StopSignal
 from rmc.common.return_text import return_text
-from rmc.common.whole_file import write_whole
+from rmc.common.whole_file import NO_ROOM, write_whole
 from rmc.deploy.monitor import main_metrics
 from rmc.deploy.monitor.metrics_log import MetricsLog
 from rmc.deploy.run.env_sizes import layout_sizes
-from rmc.deploy.run.folder import RunFolder, read_object
+from rmc.deploy.run.folder import ROOM_SECONDS, RunFolder, read_object
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.metrics_tail import MetricsTail, wall_seconds
 from rmc.deploy.run.migrations import FORMAT
@@ -51,16 +52,32 @@ def train(config: BaselineConfig, run_dir: Path | None, console: Console, stop: 
     validate(config)
     sizes = layout_sizes(env_layout(config.env))
     folder, changed = _open_folder(config, run_dir, sizes)
-    status = 1
     try:
         _set_torch(config)
-        with closing(BaselineModel(config, next(iter(saved_states(folder)[-1:]), None))) as model:
-            _write_start(config, folder, sizes, changed)
+        model = BaselineModel(config, _newest_state(folder, console))
+        _write_start(config, folder, sizes, changed)
+    except BaseException:  # this one was refused
+        folder.lock.give_back()
+        raise
+    status = 1
+    try:
+        with closing(model):
             console.print(f"run folder {folder.path}", soft_wrap=True)
             status = _conduct(config, folder, model, console, stop)
     finally:
         folder.lock.release(status)
     return status
+
+
+def _newest_state(folder: RunFolder, console: Console) -> Path | None:
+    """What the run goes on from; None where it begins. Raises ConfigError where that of a finished run is gone."""
+    if states := saved_states(folder):
+        return states[-1]
+    if folder.result() is not None:
+        raise ConfigError("RUN", str(folder.path), "has lost its checkpoint; restore it, or take another --run-dir")
+    if steps := _evaluated_steps(folder):  # killed before it was saved
+        console.print(f"no checkpoint is there of the {steps:,} steps before; they begin anew", soft_wrap=True)
+    return None
 
 
 def _set_torch(config: BaselineConfig) -> None:
@@ -72,6 +89,8 @@ def _set_torch(config: BaselineConfig) -> None:
 def _conduct(
     config: BaselineConfig, folder: RunFolder, model: BaselineModel, console: Console, stop: StopSignal
 ) -> int:
+    if (result := folder.result()) is not None and is_complete(result):  # no step is missing: it would be gone else
+        return _print_end(folder, result, console)
     result, steps = None, 0
     with suppress(_Stopped), closing(_Run(config, folder, model, console, stop)) as run:
         run.train()
@@ -82,6 +101,10 @@ def _conduct(
         console.print(f"  {resume_command(folder)}", soft_wrap=True)
         return STOPPED_STATUS
     folder.write_result(result)
+    return _print_end(folder, result, console)
+
+
+def _print_end(folder: RunFolder, result: dict[str, Any], console: Console) -> int:
     returns = return_text(result["eval_return_mean"], result["eval_return_std"])
     console.print(f"after training: return {returns}; {folder.result_file}")
     return 0
@@ -113,13 +136,13 @@ def _open_folder(config: BaselineConfig, run_dir: Path | None, sizes: dict[str, 
 
 def _write_start(config: BaselineConfig, folder: RunFolder, sizes: dict[str, Any], changed: Changes) -> None:
     """That it begins, or goes on; a start that fails before takes no result along."""
-    folder.reopen(config.total_steps)
+    for leftover in set(folder.checkpoints.glob("[0-9]*")) - set(saved_states(folder)):  # by a crash amid a save
+        shutil.rmtree(leftover)
     note_start(folder, changed, LaunchOptions(folder.path), None)
     written = json.dumps({"format": FORMAT} | asdict(config), indent=2)
     write_whole(folder.path / "config.json", f"{written}\n".encode())
     folder.write_sizes(sizes)
-    for leftover in set(folder.checkpoints.glob("[0-9]*")) - set(saved_states(folder)):  # by a crash amid a save
-        shutil.rmtree(leftover)
+    folder.reopen(config.total_steps)
 
 
 class _Stopped(Exception):
@@ -135,6 +158,7 @@ class _Run(BaseCallback):
         super().__init__()
         self.config, self.folder, self._console, self._stop = config, folder, console, stop
         self._model = model
+        self._full = False  # the disk, when it was saved last
         self._began, self._wall_before = time.monotonic(), wall_seconds(folder.metrics)
         self._save_at, self._record_at = time.monotonic() + SAVE_SECONDS, math.inf
         self._next_evaluation = self._after(min(self.steps, _evaluated_steps(folder)))  # one that was cut is made up
@@ -154,7 +178,8 @@ class _Run(BaseCallback):
         if missing > 0:
             with suppress(_Stopped):
                 self._model.sb3.learn(missing, self, reset_num_timesteps=False, log_interval=None)
-        self._model.save(self.folder)
+        while not self._saved() and not self._stop.requested:
+            time.sleep(ROOM_SECONDS)
         self._write_progress(finished=self.steps >= self.config.total_steps)
         self._record_at = math.inf  # the last evaluation is no training time
 
@@ -167,18 +192,31 @@ class _Run(BaseCallback):
         if self.num_timesteps >= self._next_evaluation:
             self._next_evaluation = self._after(self.num_timesteps)
             self._evaluate()
-            if now >= self._save_at:
-                self._model.save(self.folder)
+            if now >= self._save_at and self._saved():
                 self._save_at = time.monotonic() + SAVE_SECONDS
         return not self._stop.requested
+
+    def _saved(self) -> bool:
+        """Save; whether there was room. It is said once where there was none."""
+        try:
+            self._model.save(self.folder)
+        except OSError as error:
+            if error.errno not in NO_ROOM:
+                raise
+            if not self._full:
+                self._console.print(f"{self.folder.checkpoints} finds no room; make some", soft_wrap=True)
+            self._full = True
+            return False
+        self._full = False
+        return True
 
     def _after(self, steps: int) -> int:
         return (steps // self.config.checkpoint_steps + 1) * self.config.checkpoint_steps
 
     # Evaluation and records
 
-    def _play(self, episodes: int, final: bool) -> dict[str, Any]:
-        player, seed = self._model.player(), first_start(self.config.seed, final)
+    def _play(self, episodes: int, final: bool, model: BaselineModel | None = None) -> dict[str, Any]:
+        player, seed = (model or self._model).player(), first_start(self.config.seed, final)
         progress = EvaluationProgress(self._console, f"evaluation at step {self.steps:,}")
 
         def watch(rollout: Rollout) -> None:
@@ -196,7 +234,11 @@ class _Run(BaseCallback):
         """Of what it was before any training, once for the folder."""
         if (kept := _initial_return(self.folder)) is not None:
             return kept
-        played = self._play(FINAL_EPISODES, final=True)
+        if self.steps == 0:
+            played = self._play(FINAL_EPISODES, final=True)
+        else:  # that file was removed since
+            with closing(BaselineModel(self.config, None)) as new:
+                played = self._play(FINAL_EPISODES, final=True, model=new)
         self.folder.write_initial(played)
         return float(played["eval_return_mean"])
 

@@ -107,6 +107,7 @@ def resume(
     config, options = folder.config(), last_launch(folder, launcher)
     settings: dict[str, Any] = {"total_steps": total_steps, "actors": actors}
     how: dict[str, Any] = {"device": device and str(device), "redis_url": redis_url, "metrics_port": metrics_port}
+    how["all_cpus"] = None if actors is None else False  # a number of actors takes its place
     if replay_ratio is not None:
         settings["replay"] = replace(config.replay, replay_ratio=replay_ratio)
     if learning_rate is not None:

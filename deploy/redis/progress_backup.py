@@ -10,7 +10,7 @@ from rmc.common.bus.protocol import Bus
 from rmc.common.errors import BusFull, BusUnavailable
 from rmc.common.shard import Shard
 from rmc.common.whole_file import write_whole
-from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.folder import COUNTERS, RunFolder
 from rmc.replay_server.commit_record import crc_matches
 
 KEEP_SECONDS = 10.0
@@ -21,7 +21,7 @@ class ProgressBackup:
     """Copies of what the replay servers publish with every commit."""
 
     def __init__(self, folder: RunFolder, shards: int) -> None:
-        self._path = folder.path / "replay-counters"
+        self._path = folder.path / COUNTERS
         self._roles = [Shard(index, shards).role for index in range(shards)]
         self._kept, self._keep_at = self._read(), 0.0
 

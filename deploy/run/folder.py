@@ -37,6 +37,7 @@ RESULT = (
     "initial_return_mean",
 )
 RING = re.compile(r"replay(-\d+)?")  # a replay server's folder
+COUNTERS = "replay-counters"  # what they have counted
 INITIAL = ("eval_return_mean", "eval_return_std", "eval_episodes")
 
 

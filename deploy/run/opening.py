@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig
-from rmc.deploy.run.folder import RunFolder
+from rmc.deploy.run.folder import COUNTERS, RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.option_names import changes, option
-from rmc.deploy.run.starts import begun_with, format_begun, note_start
+from rmc.deploy.run.starts import begun_with, format_begun, has_saved, note_start
 from rmc.deploy.run.tracking import choose_tracking, keep_tracking
 from rmc.deploy.run.validation import validate_new
 
@@ -214,7 +214,9 @@ def taken_up(folder: RunFolder, config: RunConfig, options: LaunchOptions) -> Ru
     before = folder.config()
     _check_changes(folder, before, config)
     folder.check_sizes(config.env.id, config.sizes())
-    check_checkpoints(folder)
+    newest = check_checkpoints(folder)
+    if options.launcher != "manual":  # whose learner and replay servers may keep theirs elsewhere
+        _check_kept(folder, newest, options.launcher == "ray")
     _check_begun(folder, options)
     _check_unfinished(folder, before, config, options.launcher == "ray")
     return before
@@ -244,6 +246,17 @@ def _check_unfinished(folder: RunFolder, before: RunConfig, config: RunConfig, o
             raise ConfigError(option(path), now, fix)
 
 
+def _check_kept(folder: RunFolder, newest: int | None, on_ray: bool) -> None:
+    """Raises ConfigError where a copy lacks what was learnt, or how far it came: it would silently train anew."""
+    if newest is None and (has_saved(folder) or begun_with(folder)):
+        fix = "has lost its checkpoints; restore them, or take another --run-dir"
+        raise ConfigError("--run-dir", str(folder.path), fix)
+    counted = on_ray or folder.rings() or (folder.path / COUNTERS).exists()
+    if newest and not counted:
+        fix = f"has neither its replay buffer nor {COUNTERS}, which counts its steps; restore one of them"
+        raise ConfigError("--run-dir", str(folder.path), f"{fix}, or begin another run with --init-from")
+
+
 def _check_begun(folder: RunFolder, options: LaunchOptions) -> None:
     """Raises ConfigError where it is to begin with other weights than it did."""
     if options.init_from is not None and begun_with(folder).get("asked") != [options.init_from, options.init_parts]:
@@ -251,8 +264,8 @@ def _check_begun(folder: RunFolder, options: LaunchOptions) -> None:
         raise ConfigError("--init-from", options.init_from, fix)
 
 
-def check_checkpoints(folder: RunFolder) -> None:
-    """Raises ConfigError where there are checkpoints but none is whole; damaged newer ones are told."""
+def check_checkpoints(folder: RunFolder) -> int | None:
+    """The newest one's update, if there is one. Raises ConfigError where none is whole; damaged newer ones are told."""
     checkpoints = CheckpointFolder(folder.checkpoints)
     newest = checkpoints.latest()
     if newest is None and checkpoints.damaged:
@@ -260,3 +273,4 @@ def check_checkpoints(folder: RunFolder) -> None:
         raise ConfigError("--run-dir", str(folder.path), f"{fault}; none is whole, so use another --run-dir")
     if newest is not None and checkpoints.damaged:
         log.warning("the run goes on from the checkpoint of update %d", newest[0])
+    return None if newest is None else newest[0]

@@ -69,7 +69,15 @@ def _env_steps(folder: RunFolder) -> int:
     for progress in sorted(folder.checkpoints.glob(f"[0-9]*/{PROGRESS}"))[-1:]:
         with suppress(OSError, ConfigError):  # damaged, it is as none
             saved = int(read_object(progress, "env_steps")["env_steps"])
+    if not newest:  # a baseline's, which goes back to what it saved
+        return saved
     return max(learner, saved, sum(newest.values()))
+
+
+def has_saved(folder: RunFolder) -> bool:
+    """Whether its learner has said that it saved a checkpoint."""
+    said = (record.get("checkpoint_update") for record in MetricsTail(folder.metrics, LISTED_BYTES).take())
+    return any(is_finite(update) and update > 0 for update in said)
 
 
 def starts(folder: RunFolder) -> list[Start]:

@@ -1,6 +1,7 @@
 """Agents of stable-baselines3 in runs of our own format: trained, stopped, gone on with, judged by our evaluator."""
 
 import dataclasses
+import errno
 import json
 import pickle
 import re
@@ -20,6 +21,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from rmc import api
 from rmc.analysis import baseline_settings, baselines
+from rmc.analysis.baseline_model import BaselineModel
 from rmc.analysis.baseline_settings import Algorithm, BaselineConfig, Settings, choose, read_config
 from rmc.analysis.baselines import evaluate, train
 from rmc.analysis.history import of_run
@@ -36,6 +38,7 @@ from rmc.deploy.run.migrations import FORMAT
 from rmc.deploy.run.starts import note_start, starts
 from tests import habits
 from tests.command import COMMAND
+from tests.raising import raising
 
 ENV = EnvConfig("InvertedPendulum-v5")
 ALGORITHMS = get_args(Algorithm)
@@ -221,6 +224,10 @@ def test_one_that_was_killed_has_the_steps_that_it_went_back_to(finished, tmp_pa
     folder = RunFolder(shutil.copytree(finished, tmp_path / "run"))
     (folder.path / "result.json").unlink()
     note_start(folder, {}, LaunchOptions(), None)  # at 200 steps
+    with folder.metrics.open("a") as file:  # it came further, unsaved
+        file.write(json.dumps({"role": "learner", "time": time.time(), "env_steps": 290, "updates": 3}) + "\n")
+    note_start(folder, {}, LaunchOptions(), None)
+    assert [start.env_steps for start in starts(folder)] == [0, 200, 200]
     with folder.metrics.open("a") as file:
         file.write(json.dumps({"role": "learner", "time": time.time(), "env_steps": 7, "updates": 3}) + "\n")
     assert recorded_status(folder).env_steps == 7
@@ -301,6 +308,63 @@ def test_files_that_are_cut_are_named(finished, tmp_path):
                     evaluate(RunFolder(folder), 1, None, 0.0, lambda _: None)
             assert RunFolder(folder).result() is not None
         path.write_bytes(whole)
+
+
+def test_what_it_began_with_is_played_again_where_that_was_lost(finished, tmp_path):
+    folder = RunFolder(shutil.copytree(finished, tmp_path / "run"))
+    kept = json.loads(folder.initial_file.read_bytes())
+    folder.initial_file.unlink()
+    assert run(config(total_steps=250), folder.path) == 0
+    assert json.loads(folder.initial_file.read_bytes()) == kept
+    assert folder.result()["initial_return_mean"] == kept["eval_return_mean"]
+
+
+def test_a_finished_one_is_not_played_again(finished, tmp_path):
+    folder = RunFolder(shutil.copytree(finished, tmp_path / "run"))
+    before = folder.result_file.read_bytes(), folder.metrics.read_bytes()
+    assert run(config(total_steps=200), folder.path) == 0
+    assert (folder.result_file.read_bytes(), folder.metrics.read_bytes()) == before
+
+
+def test_one_without_its_checkpoint_is_refused_or_begins_anew(finished, tmp_path, capsys):
+    folder = RunFolder(shutil.copytree(finished, tmp_path / "run"))
+    shutil.rmtree(folder.checkpoints)
+    with pytest.raises(ConfigError, match="has lost its checkpoint; restore it"):
+        run(config(total_steps=250), folder.path)
+    assert (folder.lock.ended(), folder.result() is not None) == (0, True)  # as before
+    folder.result_file.unlink()  # as one that was killed before its first
+    assert train(config(total_steps=250), folder.path, Console(width=400), StopSignal()) == 0
+    assert "no checkpoint is there of the 200 steps before; they begin anew" in capsys.readouterr().out
+    assert of_run(folder).env_steps == 250
+
+
+def test_a_start_without_room_takes_no_result_along(finished, tmp_path, monkeypatch):
+    folder = RunFolder(shutil.copytree(finished, tmp_path / "run"))
+    (folder.checkpoints / "000000000250").mkdir()  # what a save without room has left: it goes first
+    full = OSError(errno.ENOSPC, "No space left on device")
+    monkeypatch.setattr(baselines, "note_start", raising(full))
+    with pytest.raises(OSError, match="No space left"):
+        run(config(total_steps=250), folder.path)
+    assert folder.result() is not None
+    assert [path.name for path in folder.checkpoints.iterdir()] == ["000000000200"]
+
+
+def test_a_full_disk_is_waited_out(tmp_path, monkeypatch, capsys):
+    folder, write, tries = tmp_path / "run", BaselineModel._write, []
+
+    def full(self, at):
+        write(self, at)
+        tries.append(at)
+        if len(tries) < 4:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(BaselineModel, "_write", full)
+    monkeypatch.setattr(baselines, "SAVE_SECONDS", 0.0)
+    monkeypatch.setattr(baselines, "ROOM_SECONDS", 0.0)
+    assert train(config(), folder, Console(width=400), StopSignal()) == 0
+    assert capsys.readouterr().out.count("finds no room") == 1
+    assert [path.name for path in (folder / "checkpoints").iterdir()] == ["000000000300"]
+    assert len(tries) > 3
 
 
 def test_an_evaluation_that_was_stopped_is_made_up(tmp_path, monkeypatch):

@@ -23,7 +23,8 @@ from rmc.cli.signals import signals_caught, signals_interrupt
 from rmc.common.errors import STOPPED_STATUS
 from rmc.deploy.run.config import checked, to_json
 from rmc.deploy.run.folder import RunFolder
-from rmc.deploy.run.launch_options import PATH_VARIABLE
+from rmc.deploy.run.launch_options import PATH_VARIABLE, LaunchOptions
+from rmc.deploy.run.opening import open_run
 from tests.runs import untrained
 
 CONFIG = rmc.presets.debug("InvertedPendulum-v5")
@@ -317,6 +318,18 @@ def test_a_callback_hears_each_record_and_its_error_ends_a_run_that_goes_on(laun
         result = rmc.resume(tmp_path / "run", total_steps=steps + 300, callback=heard.append)
         assert result["env_steps"] >= steps
         assert {"learner", "actor-0", "replay", "launcher"} <= {record["role"] for record in heard}
+
+
+def test_a_number_of_actors_takes_the_place_of_a_cluster_that_was_filled(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    last = LaunchOptions(tmp_path / "run", launcher="ray", all_cpus=True)
+    open_run(CONFIG, last).lock.release()
+    said: list[Any] = []
+    monkeypatch.setattr(api, "_train", lambda config, options, _: said.append((config.actors, options.all_cpus)))
+    rmc.resume(last.run_dir or "")
+    rmc.resume(last.run_dir or "", actors=4)
+    assert said == [(CONFIG.actors, True), (4, False)]
 
 
 def test_a_callback_that_is_no_function_is_refused(tmp_path: Path) -> None:

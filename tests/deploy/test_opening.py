@@ -85,12 +85,37 @@ def test_a_run_goes_on_from_an_older_checkpoint_and_is_refused_where_none_is_who
     checkpoints = CheckpointFolder(folder.checkpoints)
     for number in (1, 2):
         checkpoints.save(number, {"learner.pt": b"whole"})
+    (folder.path / "replay").mkdir()
     (checkpoints.path(2) / "learner.pt").write_bytes(b"other")
     open_run(CONFIG, LaunchOptions(folder.path)).lock.release()
     (checkpoints.path(1) / "learner.pt").write_bytes(b"other")
     message = "000000002: learner.pt does not match its manifest; none is whole, so use another"
     with pytest.raises(ConfigError, match=message):
         open_run(CONFIG, LaunchOptions(folder.path))
+
+
+def test_a_copy_without_its_checkpoints_is_refused(folder: RunFolder) -> None:
+    """One that was killed before the first is not."""
+    said = {"role": "learner", "time": 1.0, "env_steps": 900, "checkpoint_update": 0}
+    for update in (0, 30):
+        folder.metrics.write_text(json.dumps(said | {"checkpoint_update": update}) + "\n")
+        if update == 0:
+            open_run(CONFIG, LaunchOptions(folder.path)).lock.release()
+    with pytest.raises(ConfigError, match=r"has lost its checkpoints; restore them, or take another --run-dir"):
+        open_run(CONFIG, LaunchOptions(folder.path))
+    taken_up(folder, CONFIG, LaunchOptions(folder.path, launcher="manual"))  # they may be elsewhere
+
+
+@pytest.mark.parametrize("kept", ["replay", "replay-1", "replay-counters"])
+def test_a_copy_without_what_counts_its_steps_is_refused(kept: str, folder: RunFolder) -> None:
+    CheckpointFolder(folder.checkpoints).save(30, {"learner.pt": b"whole"})
+    (folder.path / "replay.txt").touch()
+    with pytest.raises(ConfigError, match=r"neither its replay buffer nor replay-counters, which counts its steps"):
+        open_run(CONFIG, LaunchOptions(folder.path))
+    for launcher in ("ray", "manual"):  # where they are elsewhere
+        taken_up(folder, CONFIG, LaunchOptions(folder.path, launcher=launcher))
+    (folder.path / kept).mkdir()
+    open_run(CONFIG, LaunchOptions(folder.path)).lock.release()
 
 
 def test_a_start_that_is_refused_once_it_has_the_lock_writes_nothing(folder: RunFolder) -> None:
@@ -153,6 +178,8 @@ def test_of_a_run_of_weeks_a_start_parses_what_was_said_last(
     folder: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Else every start of its launcher holds more than the one before."""
+    CheckpointFolder(folder.checkpoints).save(30, {"learner.pt": b"whole"})
+    (folder.path / "replay").mkdir()
     line = '{"role": "replay", "env_steps": 7, "more": "%s"}\n' % ("x" * 400)
     folder.metrics.write_text(line * 20_000 + '{"role": "replay", "env_steps": 9000}\n')
     parsed, parse = [], metrics_tail.parse_record
