@@ -16,7 +16,7 @@ import numpy as np
 
 from rmc.analysis import baseline_settings
 from rmc.common.bus.metrics_record import is_complete, is_finite
-from rmc.common.env.config import EnvConfig, write_kwargs
+from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
@@ -148,11 +148,11 @@ def describe(path: Path) -> About:
     folder = RunFolder(path)
     if folder.is_baseline():
         baseline = baseline_settings.read_config(folder)
-        return About(" ".join([baseline.name, *_stack(baseline.env)]), _env_label(baseline.env), baseline.seed)
+        return About(" ".join([baseline.name, *_stack(baseline.env)]), baseline.env.label(), baseline.seed)
     config = folder.config()
     name = "RMC" if config.preset == "robust" else f"RMC {config.preset}"
     agent = " ".join([name, *_changes(config, folder), *_stack(config.env), *_warm_start(folder)])
-    return About(agent, _env_label(config.env), config.seed)
+    return About(agent, config.env.label(), config.seed)
 
 
 def _changes(config: RunConfig, folder: RunFolder) -> list[str]:
@@ -193,15 +193,6 @@ def _typed(path: str, value: Any) -> str:
 def _stack(env: EnvConfig) -> list[str]:
     """A stack of frames belongs to the agent: what there is to see is the same."""
     return [f"--frame-stack {env.frame_stack}"] if env.frame_stack > 1 else []
-
-
-def _env_label(env: EnvConfig) -> str:
-    plain = EnvConfig(env.id)
-    separate = ("frame_stack", "env_timeout", "env_kwargs")  # elsewhere, or in words of its own
-    names = [item.name for item in dataclasses.fields(env) if item.name not in separate]
-    odd = [name for name in names if getattr(env, name) != getattr(plain, name)]
-    options = (f"{name.replace('_', ' ')} {getattr(env, name)}" for name in odd)
-    return ", ".join([env.id, *write_kwargs(dict(sorted(env.env_kwargs.items()))), *options])
 
 
 def _evaluations(records: Iterable[dict[str, Any]]) -> list[Evaluation]:

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
+from rmc.analysis import model_card
 from rmc.common.checkpoint import POLICY
 from rmc.common.errors import ConfigError, first_line, one_line
 from rmc.common.extra import check_installed
@@ -22,7 +23,10 @@ def check_hub(repo: str) -> None:
 
 
 def push(repo: str, files: Mapping[str, bytes], private: bool) -> str:
-    """One commit of these files; a repository that is not there is made. Its address. Raises ConfigError."""
+    """One commit of these files; a repository that is not there is made. Its address. Raises ConfigError.
+
+    Of a card that is there only RMC's part is replaced.
+    """
     from huggingface_hub import CommitOperationAdd, HfApi, get_token
 
     if get_token() is None:
@@ -30,8 +34,20 @@ def push(repo: str, files: Mapping[str, bytes], private: bool) -> str:
     api = HfApi(library_name="rmc")
     with _in_one_line(repo):
         api.create_repo(repo, private=private or None, exist_ok=True)
+        if (there := _card(repo)) is not None:
+            files = {**files, CARD: model_card.renewed(there, files[CARD].decode()).encode()}
         added = [CommitOperationAdd(name, content) for name, content in files.items()]
         return str(api.create_commit(repo, added, commit_message="Upload a policy with RMC").repo_url)
+
+
+def _card(repo: str) -> str | None:
+    """The repository's card as it is now, if it has one."""
+    from huggingface_hub import errors, hf_hub_download
+
+    try:
+        return Path(hf_hub_download(repo, CARD, library_name="rmc")).read_text()
+    except errors.EntryNotFoundError:
+        return None
 
 
 def pull(repo: str, revision: str | None = None) -> Path:

@@ -1,5 +1,6 @@
 """A policy's model card: what the hub shows of it."""
 
+import re
 from typing import Any
 
 from rmc.common.policy_header import PolicyHeader
@@ -14,6 +15,7 @@ A recurrent policy for `{env}`, trained with [RMC](https://arxiv.org/abs/1908.11
 
 | | |
 |---|---|
+| environment | {label} |
 | return, mean ± deviation | {judged} |
 | agent steps | {steps:,} |
 | observation, action, state | {sizes} |
@@ -29,6 +31,7 @@ action = policy.act(observation, units="environment")
 
 The file's header has the observation's layout, the action's bounds and all options of the environment.
 """
+OURS = re.compile(r"# [^\n]* by RMC\n.*?\nThe file's header has [^\n]*\n", re.DOTALL)  # that part of a card
 
 
 def card(header: PolicyHeader, repo: str, license_id: str | None) -> str:
@@ -46,6 +49,7 @@ def card(header: PolicyHeader, repo: str, license_id: str | None) -> str:
     return TEXT.format(
         data=data.to_yaml(),
         env=header.env.id,
+        label=header.env.label(),
         preset=header.preset,
         seed=header.seed,
         judged=header.returns() or "not evaluated",
@@ -56,11 +60,25 @@ def card(header: PolicyHeader, repo: str, license_id: str | None) -> str:
     )
 
 
+def renewed(there: str, new: str) -> str:
+    """A card that is there with RMC's part and figures of a ``new`` one. What its owner wrote stays."""
+    from huggingface_hub import ModelCard  # an extra
+
+    old, now = (ModelCard(text, ignore_metadata_errors=True) for text in (there, new))
+    part = OURS.search(now.text)
+    if part is None or not OURS.search(old.text):
+        return there
+    old.data["eval_results"] = now.data.get("eval_results")
+    old.data["license"] = now.data.get("license") or old.data.get("license")
+    old.text = OURS.sub(lambda _: part[0], old.text, count=1)
+    return str(old)
+
+
 def _results(header: PolicyHeader) -> list[Any] | None:
-    """Its evaluation as the hub reads it, None where there was none."""
+    """Its evaluation as the hub reads it: None where there was none, or of an environment that was changed."""
     from huggingface_hub import EvalResult  # an extra
 
-    if not header.returns():
+    if not header.returns() or header.env.label() != header.env.id:  # the hub compares by the id
         return None
     result = EvalResult(
         task_type="reinforcement-learning",

@@ -122,6 +122,9 @@ class Policy:
         noise = self._rng.standard_normal(shape, np.float32) if explore else None
         with one_thread():
             action, state = runner.act(rows, self._prev_action, absent, self._state, noise)
+        if not (np.isfinite(action).all() and np.isfinite(state).all()):  # which it would remember
+            fix = "too large for this policy's networks; give missing=True where a sensor has no reading"
+            raise ConfigError("observation", f"up to {np.abs(rows).max():.3g}", fix)
         self._prev_action, self._state[:] = action, state
         result = action.copy() if units == "agent" else self._in_environment(action)
         return result[0] if one else result
@@ -165,7 +168,7 @@ class Policy:
         absent = self._absent(given.astype(bool), rows, one)
         odd = ~np.isfinite(rows) & ~absent
         if odd.any():
-            if not self.header.agent.impute_missing:
+            if not self.header.agent.impute_missing or self.header.layout.frames > 1:
                 places = [place if len(rows) == 1 else (row, place) for row, place in np.argwhere(odd).tolist()]
                 values = dict(zip(places, rows[odd].tolist(), strict=True))
                 raise ConfigError("observation", values, "give finite numbers, or missing=True where there is none")
@@ -175,6 +178,8 @@ class Policy:
     def _absent(self, missing: BoolArray, rows: Floats, one: bool) -> BoolArray:
         """Flags as they were given -> (N, M); ``one`` row was given as (O,). Raises ConfigError."""
         flags, count = self.header.layout.missing, len(rows)
+        if self.header.layout.frames > 1 and missing.any():  # as in training, where a stack has no flags
+            raise ConfigError("missing", True, "leave it: a missing frame is zeros in its place of the stack")
         by_number = [(count, flags), *([(flags,)] if one else [])] if flags > 1 else []
         if missing.shape in by_number:
             return missing.reshape(count, flags)
@@ -185,8 +190,10 @@ class Policy:
 
     def _numbers(self, observation: ArrayLike) -> Floats:
         """As an array; (O,) where it has the environment's own shape. Raises ConfigError."""
+        if isinstance(observation, np.ma.MaskedArray) and np.ma.is_masked(observation):  # the mask would be lost
+            raise ConfigError("observation", "a masked array", "give its numbers, and missing= for what it masks")
         try:
-            with np.errstate(over="ignore"):  # infinity, which is judged later
+            with np.errstate(over="ignore", under="ignore"):  # infinity is judged later
                 raw = np.asarray(observation, np.float32)
         except (TypeError, ValueError, RuntimeError):  # torch raises the last for a tensor with a gradient
             fix = f"give {self.header.obs_dim} numbers, as policy.make_env() or gymnasium.spaces.flatten does"

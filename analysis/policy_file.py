@@ -1,6 +1,7 @@
 """A policy's file, from a path or out of a run: read and judged as a whole before anything acts on it."""
 
 import json
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from numbers import Integral
 from pathlib import Path
@@ -28,6 +29,7 @@ from rmc.deploy.run.validation import validate
 
 OF_SUFFIX = {  # what a file is that is no policy's
     ".json": "no policy's file; give a run's folder or a policy.safetensors",
+    ".pt": "a learner's state; give its run's folder, or the policy.safetensors beside it",
     ".onnx": "it is for onnxruntime; give its run, or what rmc export RUN --out policy.safetensors writes",
 }
 EVALUATED = ("return_mean", "return_std", "episodes")
@@ -198,7 +200,9 @@ def _of_older_run(folder: RunFolder, files: dict[str, bytes]) -> PolicyFile:
 
 def _evaluated(header: PolicyHeader, folder: RunFolder) -> PolicyHeader:
     """With how this checkpoint played: when the run ended, or while it trained."""
-    result = folder.result()
+    result = None
+    with suppress(ConfigError):  # damaged: the checkpoint is none the less whole
+        result = folder.result()
     records = [result] if result and result["updates"] == header.updates and is_complete(result) else []
     if not records:
         records = MetricsTail(folder.metrics).take()

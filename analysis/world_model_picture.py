@@ -162,7 +162,8 @@ def draw(insight: Insight, title: str, out: Path | BinaryIO, memory: MemoryInsig
     """Predicted against real amid the episode, curiosity and reward over all of it; then what is remembered."""
     from matplotlib.figure import Figure  # an extra
 
-    shown = np.argsort(-np.nan_to_num(np.abs(np.diff(insight.real, axis=0))).mean(0))[:SHOWN]
+    change = np.diff(insight.real, axis=0, prepend=insight.real[:1])  # of one step alone, too
+    shown = np.argsort(-np.nan_to_num(np.abs(change)).mean(0))[:SHOWN]
     count = len(shown) + 2 + (memory.panels if memory is not None else 0)
     figure = Figure(figsize=(11, 2.0 * count), layout="constrained")
     every = list(figure.subplots(count, 1))
@@ -176,7 +177,7 @@ def draw(insight: Insight, title: str, out: Path | BinaryIO, memory: MemoryInsig
         for horizon, predicted in insight.ahead.items():
             label = f"{horizon} step{'s' * (horizon > 1)} ahead"
             axis.plot(time[horizon - 1 :], predicted[:, dimension], linewidth=1.0, label=label)
-        axis.set_xlim(start, min(start + SHOWN_STEPS, len(time)))
+        axis.set_xlim(start, max(start + 1, min(start + SHOWN_STEPS, len(time))))
         axis.set_ylabel(f"observation {dimension}")
     axes[-2].plot(time, insight.curiosity, color="tab:purple", linewidth=0.8)
     axes[-2].set_ylabel("curiosity")

@@ -59,13 +59,14 @@ class PolicyHeader:
         """Where it comes from and how good it is, in a line."""
         returns = self.returns()
         judged = f"return {returns}" if returns else "not evaluated"
-        return f"{self.env.id} after {self.env_steps:,} steps, {judged}"
+        return f"{self.env.label()} after {self.env_steps:,} steps, {judged}"
 
     def returns(self) -> str:
         """Its evaluation in words; empty where there was none."""
         if self.eval_return_mean is None or self.eval_return_std is None:
             return ""
-        return f"{return_text(self.eval_return_mean, self.eval_return_std)} over {self.eval_episodes} episodes"
+        episodes = f"{self.eval_episodes} episode{'s' * (self.eval_episodes != 1)}"
+        return f"{return_text(self.eval_return_mean, self.eval_return_std)} over {episodes}"
 
     def metadata(self) -> dict[str, str]:
         """For a file's own metadata, which holds text."""

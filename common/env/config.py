@@ -4,7 +4,7 @@ import json
 import re
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from numbers import Integral, Real
 from typing import Any, Literal
 
@@ -65,6 +65,14 @@ class EnvConfig:
         """Whether any option takes something from the observation."""
         missing = self.flicker or self.drop_sensors
         return bool(missing or self.delay or self.noise) or self.hide != "nothing"
+
+    def label(self) -> str:
+        """Its id and what is changed about it: returns of equal labels can be compared. A stack is the agent's own."""
+        plain, separate = EnvConfig(self.id), ("frame_stack", "env_timeout", "env_kwargs")
+        names = [item.name for item in fields(self) if item.name not in separate]
+        odd = [name for name in names if getattr(self, name) != getattr(plain, name)]
+        options = (f"{name.replace('_', ' ')} {getattr(self, name)}" for name in odd)
+        return ", ".join([self.id, *write_kwargs(dict(sorted(self.env_kwargs.items()))), *options])
 
 
 def read_kwargs(words: Sequence[str]) -> dict[str, Any]:

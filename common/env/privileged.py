@@ -38,7 +38,7 @@ class Privileged(SeenWrapper):
             raise EnvFault(f'the environment\'s info["privileged"] has shape {shape}, at first {self._shape}; {fix}')
         if given is None and not self._take_observation:
             return observation, info
-        with np.errstate(over="ignore"):
+        with np.errstate(over="ignore", under="ignore"):
             numbers = np.array(observation if given is None else given, np.float32).ravel()
         check_finite("observation" if given is None else 'info["privileged"]', numbers)
         return observation, info | {"privileged": numbers}

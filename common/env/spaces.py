@@ -61,7 +61,7 @@ def _numbers(box: gym.Space[Any], value: Any) -> NDArray[np.float32]:
     numbers = array("observation", value, "an array of numbers")
     if numbers.shape != box.shape and _sides(numbers.shape) != _sides(box.shape or ()):
         raise EnvFault(f"the environment's observation has shape {numbers.shape}, its space says {box.shape}")
-    with np.errstate(over="ignore"):  # what float32 does not hold becomes infinite, and is judged with the rest
+    with np.errstate(over="ignore", under="ignore"):  # what is too large becomes infinite, and is judged with the rest
         return np.array(numbers, np.float32).ravel()  # a copy: some environments write into the same one again
 
 

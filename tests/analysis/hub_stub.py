@@ -9,7 +9,11 @@ from pathlib import Path
 from typing import Any
 
 TOKEN = "hf_writes"
-COMMIT = 40 * "a"
+
+
+def commit(files: dict[str, bytes]) -> str:
+    """The name of what a repository holds: no two states have one."""
+    return hashlib.sha1(repr(sorted(files.items())).encode()).hexdigest()
 
 
 class Hub(ThreadingHTTPServer):
@@ -98,8 +102,8 @@ class _Requests(BaseHTTPRequestHandler):
                 self.server.repos[repo][value["path"]] = base64.b64decode(value["content"])
             elif line["key"] == "lfsFile":
                 self.server.repos[repo][value["path"]] = self.server.large[value["oid"]]
-        address = f"{self.server.url}/{repo}/commit/{COMMIT}"
-        self._json({"success": True, "commitOid": COMMIT, "commitUrl": address})
+        name = commit(self.server.repos[repo])
+        self._json({"success": True, "commitOid": name, "commitUrl": f"{self.server.url}/{repo}/commit/{name}"})
 
     def _file(self) -> None:
         self._note()
@@ -111,12 +115,12 @@ class _Requests(BaseHTTPRequestHandler):
             return self._json({"id": f"{owner}/{name}"})
         resolve, revision, file = rest
         assert resolve == "resolve"
-        if revision not in ("main", COMMIT):
+        if revision not in ("main", commit(files)):
             return self._refuse(404, "RevisionNotFound")
         if file not in files:
             return self._refuse(404, "EntryNotFound")
         etag = hashlib.sha256(files[file]).hexdigest()
-        return self._send(200, files[file], {"ETag": f'"{etag}"', "X-Repo-Commit": COMMIT})
+        return self._send(200, files[file], {"ETag": f'"{etag}"', "X-Repo-Commit": commit(files)})
 
     def _body(self) -> bytes:
         self._note()

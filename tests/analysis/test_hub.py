@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,13 +13,16 @@ import yaml
 from safetensors.numpy import save
 
 from rmc.analysis.hub import push
-from rmc.analysis.policy_file import decode
+from rmc.analysis.model_card import card
+from rmc.analysis.policy_file import decode, read_policy
 from rmc.cli import main
+from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
+from rmc.deploy.run.presets import debug
 from tests.analysis.hub_stub import TOKEN, Hub
 from tests.command import complaint
 from tests.hiding import hide
-from tests.runs import AGENTS, make_run
+from tests.runs import AGENTS, make_run, run_of
 
 Call = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -71,14 +75,35 @@ def test_what_is_pushed_comes_back_and_its_card_says_what_it_is(hub: Hub, call: 
     assert (tmp_path / "back.safetensors").read_bytes() == files["policy.safetensors"]
 
 
+def test_a_return_with_other_options_is_none_of_the_plain_environment(tmp_path: Path) -> None:
+    env = EnvConfig("Pendulum-v1", flicker=0.5, delay=2, time_limit=50)
+    run = run_of(tmp_path / "run", replace(debug(env), agent=AGENTS["robust"]))
+    header = replace(read_policy(run.path).header, eval_return_mean=-9.0, eval_return_std=0.5, eval_episodes=1)
+    label = "Pendulum-v1, flicker 0.5, delay 2, time limit 50"
+    assert header.summary() == f"{label} after 70 steps, return -9.000 ± 0.500 over 1 episode"
+    text = card(header, "me/half", None)
+    assert f"| environment | {label} |" in text
+    assert "model-index" not in text
+    assert "model-index" in card(replace(header, env=EnvConfig("Pendulum-v1", frame_stack=2)), "me/half", None)
+
+
 def test_the_cards_lines_load_it(hub: Hub, call: Call, tmp_path: Path) -> None:
     make_run(tmp_path / "run", AGENTS["robust"], "Pendulum-v1")
     for _ in range(2):  # into a repository that is there, too
         pushed = call(*RMC, "push", "run", "me/bare", folder=tmp_path)
         assert (pushed.returncode, pushed.stderr) == (0, "")
+    assert call(*RMC, "push", "run", "me/bare", "--license", "mit", folder=tmp_path).returncode == 0
     card = hub.repos["me/bare"]["README.md"].decode()
+    old = card.replace("agent steps | 70", "agent steps | 60").replace("tags:\n", "tags:\n- arms\n")
+    hub.repos["me/bare"]["README.md"] = f"{old}\n## Safety\n\nKeep away.\n".encode()
+    assert call(*RMC, "push", "run", "me/bare", folder=tmp_path).returncode == 0
+    renewed = hub.repos["me/bare"]["README.md"].decode()
+    assert renewed == card.replace("tags:\n", "tags:\n- arms\n") + "\n## Safety\n\nKeep away.\n"
+    hub.repos["me/bare"]["README.md"] = b"# My own\n"
+    assert call(*RMC, "push", "run", "me/bare", folder=tmp_path).returncode == 0
+    assert hub.repos["me/bare"]["README.md"] == b"# My own\n"
     front, text = card.split("---\n")[1:]
-    assert not {"license", "model-index"} & yaml.safe_load(front).keys()
+    assert "model-index" not in yaml.safe_load(front)
     assert "| return, mean ± deviation | not evaluated |" in text
     lines = text.split("```python\n")[1].split("```")[0]
     assert len([line for line in lines.splitlines() if line]) <= 5

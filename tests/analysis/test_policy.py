@@ -20,6 +20,7 @@ import onnxruntime
 import pytest
 import torch
 from gymnasium.envs.classic_control.pendulum import PendulumEnv
+from gymnasium.spaces import Box
 from safetensors.torch import load, save
 
 from rmc import api
@@ -34,12 +35,13 @@ from rmc.cli import main, policy_commands
 from rmc.common.agent_config import AgentConfig
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.env.config import EnvConfig
+from rmc.common.env.spaces import vector
 from rmc.common.errors import STOPPED_STATUS, ConfigError
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.presets import debug
 from tests.command import complaint
 from tests.hiding import hide
-from tests.runs import AGENTS, make_run
+from tests.runs import AGENTS, make_run, run_of
 
 
 @pytest.fixture
@@ -251,6 +253,53 @@ def test_a_frame_that_is_not_finite_is_missing_or_refused(run: RunFolder, odd: f
             policy.act(bad)
     assert (policy.act(last) == other.act(last)).all()
     assert np.isfinite(policy.act(bad, missing=True)).all()
+
+
+@pytest.mark.parametrize("run", ["plain"], indirect=True)
+def test_a_reading_too_large_for_the_networks_is_refused_and_forgotten(run: RunFolder, tmp_path: Path) -> None:
+    """Once in the memory, NaN would stay there until the episode's end."""
+    whole, file = read_policy(run.path), tmp_path / "policy.safetensors"
+    larger = {name: 20 * weight for name, weight in load(whole.blob).items()}  # as training makes them
+    file.write_bytes(save(larger, whole.header.metadata()))
+    policy, other = load_policy(file), load_policy(file)
+    largest, refused = np.finfo(np.float32).max, 0
+    for signs in itertools.product((-1, 0, 1), repeat=3):
+        reading = largest * np.array(signs, np.float32)
+        try:
+            assert np.isfinite(policy.act(reading)).all()
+        except ConfigError:
+            refused += 1
+            with pytest.raises(
+                ConfigError, match=r"observation='up to 3.4e\+38': too large for this policy's networks"
+            ):
+                policy.act(reading)
+        else:
+            other.act(reading)
+        assert (policy.act(np.ones(3)) == other.act(np.ones(3))).all()
+    assert 0 < refused < 27
+
+
+def test_a_program_that_raises_for_underflow_can_act(run: RunFolder) -> None:
+    policy, other = load_policy(run.path), load_policy(run.path)
+    with np.errstate(all="raise"):
+        action = policy.act(np.full(3, 1e-50))
+        assert (vector(Box(-1, 1, (3,), np.float64), np.full(3, 1e-50)) == 0).all()
+    assert (action == other.act(np.zeros(3))).all()
+
+
+def test_a_masked_array_is_refused(run: RunFolder) -> None:
+    with pytest.raises(ConfigError, match=r"observation='a masked array': give its numbers, and missing= for what"):
+        load_policy(run.path).act(np.ma.masked_array([0.0, 9.0, 0.0], mask=[False, True, False]))
+
+
+def test_a_stack_has_zeros_for_what_is_missing(tmp_path: Path) -> None:
+    config = dataclasses.replace(debug(EnvConfig("Pendulum-v1", flicker=0.5, frame_stack=2)), agent=AGENTS["robust"])
+    policy = load_policy(run_of(tmp_path / "run", config).path)
+    with pytest.raises(ConfigError, match=r"missing=True: leave it: a missing frame is zeros in its place"):
+        policy.act(np.ones(6), missing=True)
+    with pytest.raises(ConfigError, match=r"observation={1: nan}: give finite numbers"):
+        policy.act(np.array([1.0, np.nan, 0.0, 0.0, 0.0, 0.0]))
+    assert np.isfinite(policy.act(np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0]))).all()
 
 
 @pytest.mark.parametrize(

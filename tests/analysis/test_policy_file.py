@@ -323,6 +323,7 @@ def test_what_is_no_policy_is_one_line(
     [
         ("policy.onnx", "it is for onnxruntime; give its run, or what rmc export RUN --out policy.safetensors writes"),
         ("config.json", "no policy's file; give a run's folder or a policy.safetensors"),
+        ("learner.pt", "a learner's state; give its run's folder, or the policy.safetensors beside it"),
     ],
 )
 def test_a_file_of_another_format_is_not_called_damaged(name: str, says: str, file: Path) -> None:
@@ -331,6 +332,12 @@ def test_a_file_of_another_format_is_not_called_damaged(name: str, says: str, fi
     with pytest.raises(ConfigError, match=f"^policy file='{other}': {says}$"):
         load_policy(other)
     assert load_policy(file.rename(file.with_suffix(".bak"))).header.env_steps == 70
+
+
+def test_a_damaged_result_leaves_the_policy_as_it_is(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run", AGENTS["robust"], "Pendulum-v1")
+    run.result_file.write_text("{")
+    assert load_policy(run.path).header.returns() == ""
 
 
 def test_weights_that_are_not_finite_are_refused(file: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -93,6 +93,12 @@ def test_the_command_writes_a_picture_and_says_it_in_numbers(
     assert "ends in .png" in complaint([*words, str(tmp_path / "seen.xyz")], capsys)
 
 
+def test_an_episode_of_one_step_is_drawn(config: RunConfig, tmp_path: Path) -> None:
+    """Without warnings of numpy or matplotlib."""
+    folder = run_of(tmp_path / "run", dataclasses.replace(config, env=EnvConfig("Pendulum-v1", time_limit=1)))
+    assert main.run(["inspect", str(folder.path), "--out", str(tmp_path / "seen.png")]) == 0
+
+
 def test_critics_of_longer_targets_are_not_compared(
     config: RunConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
