@@ -69,7 +69,7 @@ def _env_steps(folder: RunFolder) -> int:
     for progress in sorted(folder.checkpoints.glob(f"[0-9]*/{PROGRESS}"))[-1:]:
         with suppress(OSError, ConfigError):  # damaged, it is as none
             saved = int(read_object(progress, "env_steps")["env_steps"])
-    if not newest:  # a baseline's, which goes back to what it saved
+    if (folder.path / "config.json").exists() and folder.is_baseline():  # which goes back to what it saved
         return saved
     return max(learner, saved, sum(newest.values()))
 

@@ -100,6 +100,7 @@ def test_an_environment_whose_actions_have_other_bounds_is_named(
     tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run, kept = (make_run(tmp_path / name, AGENTS["robust"], SLIDE) for name in ("run", "kept"))
+    (kept.path / "replay").mkdir()
     kept.write_sizes({"observations": 3, "actions": 2, "flags of what is missing": 1})  # as an older version
     monkeypatch.setattr(habits.Slide, "action_space", Box(-1.0, np.float32([1, 5]), (2,), np.float32))
     says = f"ENV='{SLIDE}': the environment now has the highest actions [1.0, 5.0], the run was trained with [1.0, 1.0]"

@@ -446,6 +446,7 @@ def test_a_newer_damaged_checkpoint_is_told_where_the_run_goes_on(
         checkpoints.save(update, {"state": b"x"})
     for update in (20, 30):
         (checkpoints.path(update) / "state").write_bytes(b"y")
+    (folder.path / "replay").mkdir()
     untrained(tmp_path / "run", config)
     messages = [record.getMessage() for record in caplog.records]
     assert len(messages) == 3
