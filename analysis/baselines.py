@@ -40,6 +40,7 @@ from rmc.deploy.run.opening import default_name, forget_start, has_more_than_a_s
 from rmc.deploy.run.option_names import changes, flat, option
 from rmc.deploy.run.starts import note_start, resume_command
 from rmc.deploy.run.state import remedy
+from rmc.deploy.run.validation import validate_new_env
 
 MAY_CHANGE = {"total_steps", "threads", "checkpoint_steps", "episodes", "env.env_timeout"}
 SAVE_SECONDS = 120.0  # between states that can be gone on with: a replay buffer is large
@@ -112,6 +113,8 @@ def _print_end(folder: RunFolder, result: dict[str, Any], console: Console) -> i
 
 def _open_folder(config: BaselineConfig, run_dir: Path | None, sizes: dict[str, Any]) -> tuple[RunFolder, Changes]:
     """Make or take up a run's folder, locked, as ``open_run``; what is other than before. Raises ConfigError."""
+    if run_dir is None or not (run_dir / "config.json").exists():
+        validate_new_env(config.env)
     name = default_name(config.env.id, f"{config.algorithm}-{config.settings}", config.seed)
     folder = RunFolder(run_dir) if run_dir is not None else new_folder(Path("runs").resolve() / name)
     there = (folder.path / "config.json").exists() and folder.is_baseline()

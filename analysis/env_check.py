@@ -28,6 +28,7 @@ from rmc.common.window import BoolArray, Floats
 from rmc.deploy.run.config import WindowConfig
 from rmc.deploy.run.env_sizes import env_sizes, layout_sizes
 from rmc.deploy.run.memory_reach import format_reach
+from rmc.deploy.run.validation import validate_new_env
 
 BESIDE_THE_POINT = (  # of vectors, stretched actions, what watches the environment, and what is judged better below
     "is -infinity", "is infinity", "symmetric and normalized", "different from the unwrapped version",
@@ -46,7 +47,7 @@ LARGE_OBSERVATION = 1e4  # from which float32 and a running mean lose precision
 class Played:
     """What random episodes gave."""
 
-    observations: list[Floats] = field(default_factory=list)
+    observations: list[Floats] = field(default_factory=list)  # NaN where they were missing
     rewards: list[float] = field(default_factory=list)
     lengths: list[int] = field(default_factory=list)  # of episodes that ended
     terminated: int = 0
@@ -56,24 +57,28 @@ class Played:
     def play(self, env: Env, steps: int, seed: int) -> None:
         """So many steps with uniform actions. Raises what the environment raises."""
         rng, length = np.random.default_rng(seed), 0
-        self.observations.append(env.reset(seed=seed)[0])
+        self._see(*env.reset(seed=seed))
         for _ in range(steps):
             start = time.perf_counter()
             observation, reward, terminated, truncated, info = env.step(_action(env, rng))
             self.seconds += time.perf_counter() - start
-            self.observations.append(observation)
+            self._see(observation, info)
             self.rewards.append(float(reward))
             self.missing.append(float(np.mean(info.get("missing", False))))
             length += 1
             if terminated or truncated:
                 self.lengths.append(length)
                 self.terminated += bool(terminated)
-                self.observations.append(env.reset()[0])
+                self._see(*env.reset())
                 length = 0
+
+    def _see(self, observation: Floats, info: dict[str, Any]) -> None:
+        self.observations.append(np.where(info.get("missing", False), np.float32(np.nan), observation))
 
 
 def check(config: EnvConfig, steps: int, console: Console) -> int:
     """Print facts, notes and faults; 0 where there is no fault, else 1. Raises ConfigError as ``rmc train`` would."""
+    validate_new_env(config)
     env, played = first_env(config), Played()
     layout = layout_of(env, config, {}, privileged=False)
     stages: list[Callable[[], Iterable[str]]] = [
@@ -163,14 +168,16 @@ def _nonsense(played: Played) -> Iterator[str]:
 
 def _hints(played: Played, time_limit: int | None) -> Iterator[str]:
     observations, rewards = np.stack(played.observations, dtype=np.float64), np.array(played.rewards)
-    still = np.ptp(observations, axis=0) == 0.0
-    faint = ~still & (observations.std(0) < STD_FLOOR)
+    seen = ~np.isnan(observations).all(0)
+    observations[:, ~seen] = 0.0
+    still = seen & (np.nanmax(observations, 0) == np.nanmin(observations, 0))
+    faint = seen & ~still & (np.nanstd(observations, 0) < STD_FLOOR)
     if still.any():
         yield f"note: observations {_listed(still)} never changed"
     if faint.any():
         yield f"note: observations {_listed(faint)} vary by less than {STD_FLOOR}; scale them up in the environment"
-    if np.abs(observations).max() > LARGE_OBSERVATION:
-        yield f"note: observations reach {np.abs(observations).max():.3g}; scale them in the environment"
+    if np.nanmax(np.abs(observations)) > LARGE_OBSERVATION:
+        yield f"note: observations reach {np.nanmax(np.abs(observations)):.3g}; scale them in the environment"
     yield from _reward_notes(np.abs(rewards))
     if not rewards.any():
         yield "note: no random step was rewarded; learning will need luck, or curiosity (--curiosity)"
@@ -188,7 +195,7 @@ def _repeated(env: Env) -> Iterator[str]:
 
     yield from _guarded(play_both)
     once, again = (one.observations for one in twice)
-    if len(twice[1].rewards) == REPEATED_STEPS and not np.array_equal(once, again):
+    if len(twice[1].rewards) == REPEATED_STEPS and not np.array_equal(once, again, equal_nan=True):
         yield "note: the same seed and actions gave other observations; runs will not be repeatable"
 
 

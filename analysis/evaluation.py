@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import safetensors.torch
 from rich.console import Console
 
@@ -63,6 +64,18 @@ def policy_env(header: PolicyHeader, config: EnvConfig) -> Env:
     return env
 
 
+def _playable(header: PolicyHeader, config: EnvConfig) -> Env:
+    """``policy_env`` that says what is missing as it did in training: by the frame, or by number."""
+    env = policy_env(header, config)
+    _, info = env.reset(seed=0)  # an evaluation seeds every episode
+    flags = np.size(info.get("missing", False))
+    if flags not in (1, header.layout.missing):
+        env.close()
+        fix = f"the environment now gives {flags}, the policy reads {header.layout.missing}; undo that"
+        raise ConfigError('info["missing"]', f"{flags} flags", fix)
+    return env
+
+
 def evaluate_policy(
     policy: PolicyFile, episodes: int, flicker: float | None = None, seconds: float = 0.0, watch: Watch = lambda _: None
 ) -> dict[str, Any]:
@@ -76,7 +89,7 @@ def evaluate_policy(
     runner, seed = policy_runner(header, policy.blob), first_start(header.seed, final=True)
     with one_thread():
         try:
-            rollout = play_episodes(runner, lambda: policy_env(header, env), episodes, seed, seconds, watch)
+            rollout = play_episodes(runner, lambda: _playable(header, env), episodes, seed, seconds, watch)
         except EnvFault as fault:
             raise EnvFault(f"{fault}; rmc check-env {env.id} says more") from fault
     about = {name: getattr(header, name) for name in ("preset", "seed", "env_steps", "updates")}

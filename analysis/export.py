@@ -28,9 +28,10 @@ INPUTS, OUTPUTS = ("observation", "previous_action", "missing", "state"), ("acti
 class _Step(nn.Module):
     """One step of the policy's mean."""
 
-    def __init__(self, agent: Agent) -> None:
+    def __init__(self, agent: Agent, takes_odd: bool) -> None:
+        """``takes_odd``: what is not finite counts as missing."""
         super().__init__()
-        self.agent = agent
+        self.agent, self._takes_odd = agent, takes_odd
 
     def forward(
         self, observation: Tensor, previous_action: Tensor, missing: Tensor, state: Tensor
@@ -38,7 +39,7 @@ class _Step(nn.Module):
         """See the module's docstring."""
         by_number = missing.ndim == 2
         missing = missing if by_number else missing.unsqueeze(1)
-        if self.agent.config.impute_missing:  # as ``Policy.act`` has it
+        if self._takes_odd:
             odd = ~torch.isfinite(observation)
             missing = missing | (odd if by_number else odd.any(1, keepdim=True))
         normalized = self.agent.normalizer(observation, missing).unsqueeze(1)
@@ -58,10 +59,11 @@ def export(policy: PolicyFile, out: Path) -> None:
     two = [torch.zeros(2, size) for size in header.sizes().values()]
     missing = torch.zeros((2, flags) if flags > 1 else (2,), dtype=torch.bool)
     example = (two[0], two[1], missing, two[2])
+    takes_odd = header.agent.impute_missing and header.layout.frames == 1  # as ``Policy.act`` has it
     rows = torch.export.Dim("rows", min=1)
     with _quiet():
         program = torch.onnx.export(
-            _Step(agent).eval(), example, input_names=INPUTS, output_names=OUTPUTS,
+            _Step(agent, takes_odd).eval(), example, input_names=INPUTS, output_names=OUTPUTS,
             dynamic_shapes=({0: rows},) * 4, dynamo=True,
         )  # fmt: skip
         assert program is not None

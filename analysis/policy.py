@@ -123,11 +123,16 @@ class Policy:
         with one_thread():
             action, state = runner.act(rows, self._prev_action, absent, self._state, noise)
         if not (np.isfinite(action).all() and np.isfinite(state).all()):  # which it would remember
-            fix = "too large for this policy's networks; give missing=True where a sensor has no reading"
+            fix = f"too large for this policy's networks; give {self._nothing} where a sensor has no reading"
             raise ConfigError("observation", f"up to {np.abs(rows).max():.3g}", fix)
         self._prev_action, self._state[:] = action, state
         result = action.copy() if units == "agent" else self._in_environment(action)
         return result[0] if one else result
+
+    @property
+    def _nothing(self) -> str:
+        """What stands for a frame that is missing, as in training."""
+        return "missing=True" if self.header.layout.frames == 1 else "zeros"
 
     def _begin(self, rows: int) -> PolicyRunner:
         """What acts in so many episodes; new ones begin after ``reset``."""
@@ -171,7 +176,7 @@ class Policy:
             if not self.header.agent.impute_missing or self.header.layout.frames > 1:
                 places = [place if len(rows) == 1 else (row, place) for row, place in np.argwhere(odd).tolist()]
                 values = dict(zip(places, rows[odd].tolist(), strict=True))
-                raise ConfigError("observation", values, "give finite numbers, or missing=True where there is none")
+                raise ConfigError("observation", values, f"give finite numbers, or {self._nothing} where there is none")
             absent |= odd if absent.shape == odd.shape else odd.any(1, keepdims=True)
         return rows, absent, one
 
@@ -191,7 +196,8 @@ class Policy:
     def _numbers(self, observation: ArrayLike) -> Floats:
         """As an array; (O,) where it has the environment's own shape. Raises ConfigError."""
         if isinstance(observation, np.ma.MaskedArray) and np.ma.is_masked(observation):  # the mask would be lost
-            raise ConfigError("observation", "a masked array", "give its numbers, and missing= for what it masks")
+            fix = f"give its numbers, and {self._nothing} for what it masks"
+            raise ConfigError("observation", "a masked array", fix)
         try:
             with np.errstate(over="ignore", under="ignore"):  # infinity is judged later
                 raw = np.asarray(observation, np.float32)

@@ -64,8 +64,8 @@ def _check_fit(env: gym.Env[Any, Any], config: EnvConfig, limit: int | None) -> 
     if fault is not None:
         raise ConfigError("ENV", config.id, fault)
     steps = agent_steps(limit, config)
-    if steps is not None and config.delay >= steps:  # only an episode's first observation would be seen
-        raise ConfigError("--delay", config.delay, f"an episode ends after {steps} steps; take fewer")
+    if steps is not None and config.delay and config.delay >= steps - 1:  # all actions would see the first observation
+        raise ConfigError("--delay", config.delay, f"an episode ends after {steps} steps; take fewer than {steps - 1}")
 
 
 def _says_parts(env: gym.Env[Any, Any]) -> bool:

@@ -1,7 +1,7 @@
 """Which configurations make no sense; numbers of the environment are judged in ``common/env/config.py``."""
 
 from rmc.common.bus.redis_url import redacted
-from rmc.common.env.config import check_env_config, check_range
+from rmc.common.env.config import EnvConfig, check_env_config, check_range
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig, WindowConfig
 from rmc.deploy.run.launch_options import LaunchOptions
@@ -108,8 +108,13 @@ def validate_new(config: RunConfig) -> None:
         raise ConfigError(
             "--missing-flag", True, "the memory reads it, and --head-input observation has none; leave it"
         )
-    if config.env.flicker_burst > 1.0 and not (config.env.flicker or config.env.drop_sensors):
-        raise ConfigError("--flicker-burst", config.env.flicker_burst, "nothing is missing; give --flicker, too")
+    validate_new_env(config.env)
+
+
+def validate_new_env(env: EnvConfig) -> None:
+    """Raises ConfigError for what would change nothing."""
+    if env.flicker_burst > 1.0 and not (env.flicker or env.drop_sensors):
+        raise ConfigError("--flicker-burst", env.flicker_burst, "nothing is missing; give --flicker, too")
 
 
 def validate_launch(config: RunConfig, options: LaunchOptions) -> None:

@@ -233,6 +233,12 @@ def test_one_that_was_killed_has_the_steps_that_it_went_back_to(finished, tmp_pa
     assert recorded_status(folder).env_steps == 7
 
 
+def test_bursts_of_nothing_are_refused_before_there_is_a_folder(tmp_path):
+    with pytest.raises(ConfigError, match=r"--flicker-burst=5.0: nothing is missing"):
+        run(config(env=EnvConfig("InvertedPendulum-v5", flicker_burst=5.0)), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_stack_of_frames_belongs_to_the_agent(tmp_path):
     settings = config(env=EnvConfig("InvertedPendulum-v5", flicker=0.5, frame_stack=4), total_steps=100)
     assert run(settings, tmp_path / "run") == 0

@@ -209,6 +209,10 @@ def test_what_is_strange_is_noted_with_the_option_that_helps(capsys):
     assert "the same seed and actions gave other observations" in text
     assert "--curiosity" in checked("Unrewarded-v0", capsys, "--steps", "100")[1]
     assert "observations 0, 1, 2 vary by less than 0.01; scale them up" in checked("Faint-v0", capsys)[1]
+    assert "observations 0, 1, 2 vary by less than 0.01" in checked("Faint-v0", capsys, "--drop-sensors", "0.5")[1]
+    assert "vary by less" not in checked("Faint-v0", capsys, "--flicker", "1")[1]  # nobody knows
+    status = main.run(["check-env", "Faint-v0", "--flicker-burst", "5"])
+    assert (status, "--flicker-burst=5.0: nothing is missing; give --flicker" in capsys.readouterr().err) == (2, True)
     still = checked("Constant-v0", capsys)[1]
     assert "observations 0, 1, 2 never changed" in still
     assert "scale them up" not in still

@@ -28,6 +28,7 @@ from rmc.actors.evaluator import first_start
 from rmc.actors.policy_runner import one_thread
 from rmc.analysis import policy as policy_module
 from rmc.analysis.evaluation import evaluate_policy
+from rmc.analysis.export import export
 from rmc.analysis.policy import Policy, load_policy
 from rmc.analysis.policy_file import read_policy
 from rmc.analysis.run_evaluation import evaluate_run
@@ -288,7 +289,7 @@ def test_a_program_that_raises_for_underflow_can_act(run: RunFolder) -> None:
 
 
 def test_a_masked_array_is_refused(run: RunFolder) -> None:
-    with pytest.raises(ConfigError, match=r"observation='a masked array': give its numbers, and missing= for what"):
+    with pytest.raises(ConfigError, match=r"observation='a masked array': give its numbers, and missing=True for what"):
         load_policy(run.path).act(np.ma.masked_array([0.0, 9.0, 0.0], mask=[False, True, False]))
 
 
@@ -297,7 +298,7 @@ def test_a_stack_has_zeros_for_what_is_missing(tmp_path: Path) -> None:
     policy = load_policy(run_of(tmp_path / "run", config).path)
     with pytest.raises(ConfigError, match=r"missing=True: leave it: a missing frame is zeros in its place"):
         policy.act(np.ones(6), missing=True)
-    with pytest.raises(ConfigError, match=r"observation={1: nan}: give finite numbers"):
+    with pytest.raises(ConfigError, match=r"observation={1: nan}: give finite numbers, or zeros where there is none"):
         policy.act(np.array([1.0, np.nan, 0.0, 0.0, 0.0, 0.0]))
     assert np.isfinite(policy.act(np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0]))).all()
 
@@ -381,6 +382,35 @@ def test_onnx_acts_alike(run: RunFolder, tmp_path: Path, capsys: pytest.CaptureF
         ]
         np.testing.assert_array_equal(actions[0][0], actions[1][0])
         np.testing.assert_array_equal(actions[0][1], actions[1][1])
+
+
+def test_onnx_takes_nothing_in_a_stack_for_missing(tmp_path: Path) -> None:
+    """It fills no whole stack for one number, as it never did in training."""
+    config = dataclasses.replace(debug(EnvConfig("Pendulum-v1", frame_stack=2)), agent=AGENTS["filling blanks"])
+    policy, out = read_policy(run_of(tmp_path / "run", config).path), tmp_path / "policy.onnx"
+    export(policy, out)
+    session = onnxruntime.InferenceSession(str(out), providers=["CPUExecutionProvider"])
+    sizes = policy.header.sizes()
+    feed = {
+        name: np.zeros((1, sizes[name.removeprefix("previous_")]), np.float32) for name in ("previous_action", "state")
+    }
+    seen = np.array([[np.nan, 1.0, 0.0, 0.0, 0.0, 0.0]], np.float32)
+    odd, filled = (
+        session.run(None, {"observation": frame, "missing": np.array([missing]), **feed})[0]
+        for frame, missing in ((seen, False), (np.nan_to_num(seen), True))
+    )
+    assert (odd != filled).all()
+
+
+def test_an_environment_that_says_by_number_what_is_missing_since_is_refused(tmp_path: Path) -> None:
+    by_frame = {"missing": "frame"}
+    run = make_run(tmp_path / "run", AGENTS["robust"], "tests.partial_env:Partial-v0", env_kwargs=by_frame)
+    policy = read_policy(run.path)
+    evaluate_policy(policy, 1)
+    env = dataclasses.replace(policy.header.env, env_kwargs={"missing": "number"})
+    changed = dataclasses.replace(policy, header=dataclasses.replace(policy.header, env=env))
+    with pytest.raises(ConfigError, match=r"the environment now gives 3, the policy reads 1; undo that"):
+        evaluate_policy(changed, 1)
 
 
 def test_export_says_what_is_wrong_in_one_line(

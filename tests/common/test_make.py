@@ -182,11 +182,13 @@ def test_a_limit_of_the_users_own_wrapper_is_known() -> None:
         (within, 20), (replace(within, time_limit=7), 7), (replace(within, action_repeat=3), 7),
     ):  # fmt: skip
         assert env_layout(config).time_limit == steps
-        env = make_env(replace(config, delay=steps - 1))
+        env = make_env(replace(config, delay=steps - 2))
         env.reset(seed=0)
         assert [env.step(np.zeros(2, np.float32))[3] for _ in range(steps)] == [False] * (steps - 1) + [True]
-        with pytest.raises(ConfigError, match=rf"^--delay={steps}: an episode ends after {steps} steps; take fewer$"):
-            make_env(replace(config, delay=steps))
+        fix = f"an episode ends after {steps} steps; take fewer than {steps - 1}"
+        for late in (steps - 1, steps):  # with the first of both, too, every action sees the first observation alone
+            with pytest.raises(ConfigError, match=rf"^--delay={late}: {fix}$"):
+                make_env(replace(config, delay=late))
 
 
 def test_a_users_own_wrapper_may_go_on_past_a_limit_within_it() -> None:
