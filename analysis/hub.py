@@ -45,8 +45,8 @@ def _card(repo: str) -> str | None:
     from huggingface_hub import errors, hf_hub_download
 
     try:
-        return Path(hf_hub_download(repo, CARD, library_name="rmc")).read_text()
-    except errors.EntryNotFoundError:
+        return Path(hf_hub_download(repo, CARD, library_name="rmc", force_download=True)).read_text()
+    except errors.RemoteEntryNotFoundError:  # an outage raises another, and replaces no card
         return None
 
 

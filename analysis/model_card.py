@@ -61,16 +61,22 @@ def card(header: PolicyHeader, repo: str, license_id: str | None) -> str:
 
 
 def renewed(there: str, new: str) -> str:
-    """A card that is there with RMC's part and figures of a ``new`` one. What its owner wrote stays."""
+    """A card that is there with RMC's part and figures of a ``new`` one. What its owner wrote stays.
+
+    One of the owner's own, without that part, takes the license alone. One without text is replaced.
+    """
     from huggingface_hub import ModelCard  # an extra
 
     old, now = (ModelCard(text, ignore_metadata_errors=True) for text in (there, new))
-    part = OURS.search(now.text)
-    if part is None or not OURS.search(old.text):
-        return there
-    old.data["eval_results"] = now.data.get("eval_results")
-    old.data["license"] = now.data.get("license") or old.data.get("license")
-    old.text = OURS.sub(lambda _: part[0], old.text, count=1)
+    given = now.data.get("license")
+    old.data["license"] = given or old.data.get("license")
+    if old.text.strip() and not OURS.search(old.text):
+        return str(old) if given else there
+    part = OURS.findall(now.text)[0]
+    for name in ("eval_results", "library_name", "model_name", "pipeline_tag"):
+        old.data[name] = now.data.get(name)
+    old.data["tags"] = [*dict.fromkeys([*now.data["tags"], *(old.data.get("tags") or [])])]
+    old.text = OURS.sub(lambda _: part, old.text, count=1) if old.text.strip() else now.text
     return str(old)
 
 

@@ -289,7 +289,7 @@ class Learner:
         self._damaged_checkpoints = len(self.checkpoints.damaged)
         if newest is None:
             if self._damaged_checkpoints:
-                raise CheckpointError(f"{self.checkpoints.folder}: none is valid; restore one, or begin another run")
+                raise CheckpointError(f"{self.checkpoints.folder}: no checkpoint is valid; restore one")
             return 0
         number, files = newest
         try:

@@ -217,6 +217,7 @@ def taken_up(folder: RunFolder, config: RunConfig, options: LaunchOptions) -> Ru
     newest = check_checkpoints(folder)
     if options.launcher != "manual":  # whose learner and replay servers may keep theirs elsewhere
         _check_kept(folder, newest, options.launcher == "ray")
+    _check_initial(folder, newest, config.total_steps)
     _check_begun(folder, options)
     _check_unfinished(folder, before, config, options.launcher == "ray")
     return before
@@ -255,6 +256,15 @@ def _check_kept(folder: RunFolder, newest: int | None, on_ray: bool) -> None:
     if newest and not counted:
         fix = f"has neither its replay buffer nor {COUNTERS}, which counts its steps; restore one of them"
         raise ConfigError("--run-dir", str(folder.path), f"{fix}, or begin another run with --init-from")
+
+
+def _check_initial(folder: RunFolder, newest: int | None, total_steps: int) -> None:
+    """Raises ConfigError where nobody can tell any more how the networks played that it began with."""
+    if newest and begun_with(folder) and folder.initial() is None:
+        result = folder.result()
+        if result is None or result["env_steps"] < total_steps:
+            fix = "is lost or damaged, and so is what the run began with; restore that file"
+            raise ConfigError("RUN", str(folder.initial_file), fix)
 
 
 def _check_begun(folder: RunFolder, options: LaunchOptions) -> None:

@@ -27,7 +27,7 @@ from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.memory_reach import reach_note
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.preflight import check_machine
-from rmc.deploy.run.starts import begun_with, resume_command
+from rmc.deploy.run.starts import resume_command
 from rmc.deploy.run.validation import validate, validate_launch
 
 
@@ -197,9 +197,6 @@ def _before(config: RunConfig, folder: RunFolder, seconds: float, console: Conso
     from rmc.analysis.policy_file import PolicyFile
 
     number, files = CheckpointFolder(folder.checkpoints).latest() or (0, {})
-    if number and begun_with(folder):
-        fix = "is lost or damaged, and so is what it began with; restore that file"
-        raise ConfigError("RUN", str(folder.initial_file), fix)
     blob = files[POLICY] if files and number == 0 else evaluation.initial_policy(config)
     policy = PolicyFile(config.policy_header(), blob)
     progress = evaluation.EvaluationProgress(console, "before training")

@@ -13,7 +13,7 @@ import yaml
 from safetensors.numpy import save
 
 from rmc.analysis.hub import push
-from rmc.analysis.model_card import card
+from rmc.analysis.model_card import card, renewed
 from rmc.analysis.policy_file import decode, read_policy
 from rmc.cli import main
 from rmc.common.env.config import EnvConfig
@@ -93,16 +93,18 @@ def test_the_cards_lines_load_it(hub: Hub, call: Call, tmp_path: Path) -> None:
         pushed = call(*RMC, "push", "run", "me/bare", folder=tmp_path)
         assert (pushed.returncode, pushed.stderr) == (0, "")
     assert call(*RMC, "push", "run", "me/bare", "--license", "mit", folder=tmp_path).returncode == 0
-    card = hub.repos["me/bare"]["README.md"].decode()
-    old = card.replace("agent steps | 70", "agent steps | 60").replace("tags:\n", "tags:\n- arms\n")
-    hub.repos["me/bare"]["README.md"] = f"{old}\n## Safety\n\nKeep away.\n".encode()
+    pushed_card = hub.repos["me/bare"]["README.md"].decode()
+    more = pushed_card.replace("- Pendulum-v1\n", "- Pendulum-v1\n- arms\n") + "\n## Safety\n\nKeep away.\n"
+    old = more.replace("agent steps | 70", "agent steps | 60")
+    hub.repos["me/bare"]["README.md"] = old.encode()
     assert call(*RMC, "push", "run", "me/bare", folder=tmp_path).returncode == 0
-    renewed = hub.repos["me/bare"]["README.md"].decode()
-    assert renewed == card.replace("tags:\n", "tags:\n- arms\n") + "\n## Safety\n\nKeep away.\n"
+    assert hub.repos["me/bare"]["README.md"].decode() == more
+    assert renewed("---\nlicense: mit\n---\n", pushed_card) == pushed_card  # of a repository that was made by hand
+    assert renewed("# My own\n", pushed_card) == "---\nlicense: mit\n---\n# My own\n"
     hub.repos["me/bare"]["README.md"] = b"# My own\n"
     assert call(*RMC, "push", "run", "me/bare", folder=tmp_path).returncode == 0
     assert hub.repos["me/bare"]["README.md"] == b"# My own\n"
-    front, text = card.split("---\n")[1:]
+    front, text = pushed_card.split("---\n")[1:]
     assert "model-index" not in yaml.safe_load(front)
     assert "| return, mean ± deviation | not evaluated |" in text
     lines = text.split("```python\n")[1].split("```")[0]

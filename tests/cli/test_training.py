@@ -19,7 +19,7 @@ from rmc.cli.ending import print_end
 from rmc.cli.signals import signals_caught, signals_interrupt
 from rmc.cli.training import conduct
 from rmc.common.checkpoint import CheckpointFolder
-from rmc.common.errors import STOPPED_STATUS, ConfigError, RoleDied
+from rmc.common.errors import STOPPED_STATUS, RoleDied
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
 from tests.counting_env import CountingEnv
@@ -98,10 +98,6 @@ def test_the_untrained_policy_is_played_once(folder, monkeypatch):
         assert folder.initial_file.read_bytes() == kept
     folder.initial_file.unlink()
     assert (train(), len(played)) == (first, 2)
-    folder.initial_file.unlink()  # of one that began with another's networks, which are gone, nobody can play it again
-    monkeypatch.setattr(training, "begun_with", lambda _: {"run": "another"})
-    with pytest.raises(ConfigError, match=r"is lost or damaged, and so is what it began with"):
-        train()
 
 
 def test_an_evaluation_without_end_shows_that_it_goes_on_and_is_cut(tmp_path, monkeypatch, capsys):

@@ -106,6 +106,19 @@ def test_a_copy_without_its_checkpoints_is_refused(folder: RunFolder) -> None:
     taken_up(folder, CONFIG, LaunchOptions(folder.path, launcher="manual"))  # they may be elsewhere
 
 
+def test_a_run_that_has_lost_what_it_began_with_keeps_its_result(
+    folder: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(opening, "begun_with", lambda _: {"asked": ["another", "all"]})
+    CheckpointFolder(folder.checkpoints).save(30, {"learner.pt": b"whole"})
+    (folder.path / "replay").mkdir()
+    folder.write_result(FINISHED)
+    open_run(CONFIG, LaunchOptions(folder.path)).lock.release()  # no step is missing
+    with pytest.raises(ConfigError, match=r"initial.json': is lost or damaged, and so is what the run began with"):
+        open_run(dataclasses.replace(CONFIG, total_steps=9_000), LaunchOptions(folder.path))
+    assert folder.result() == FINISHED
+
+
 @pytest.mark.parametrize("kept", ["replay", "replay-1", "replay-counters"])
 def test_a_copy_without_what_counts_its_steps_is_refused(kept: str, folder: RunFolder) -> None:
     CheckpointFolder(folder.checkpoints).save(30, {"learner.pt": b"whole"})
