@@ -9,7 +9,7 @@ import json
 import math
 import shutil
 import time
-from contextlib import closing, suppress
+from contextlib import ExitStack, closing, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -53,20 +53,20 @@ def train(config: BaselineConfig, run_dir: Path | None, console: Console, stop: 
     validate(config)
     sizes = layout_sizes(env_layout(config.env))
     folder, changed = _open_folder(config, run_dir, sizes)
-    try:
-        _set_torch(config)
-        model = BaselineModel(config, _newest_state(folder, console))
-        _write_start(config, folder, sizes, changed)
-    except BaseException:  # this one was refused
-        folder.lock.give_back()
-        raise
-    status = 1
-    try:
-        with closing(model):
+    with ExitStack() as leave:
+        try:
+            _set_torch(config)
+            model = leave.enter_context(closing(BaselineModel(config, _newest_state(folder, console))))
+            _write_start(config, folder, sizes, changed)
+        except BaseException:  # this one was refused
+            folder.lock.give_back()
+            raise
+        status = 1
+        try:
             console.print(f"run folder {folder.path}", soft_wrap=True)
             status = _conduct(config, folder, model, console, stop)
-    finally:
-        folder.lock.release(status)
+        finally:
+            folder.lock.release(status)
     return status
 
 

@@ -1,4 +1,4 @@
-"""SAC, TD3 and DDPG of SBX (stable-baselines3 in JAX), with heads like ours: several times as fast on one core.
+"""SAC, TD3 and DDPG of SBX (stable-baselines3 in JAX), with heads like ours, faster on one core.
 
     python -m studies.sbx --env ENV ... [--only SAC TD3 DDPG] [--seeds 1 2 3] [--steps 300000]
 
