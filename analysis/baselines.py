@@ -6,9 +6,7 @@ The run's folder looks like that of ``rmc train``, so that ``rmc plot`` reads bo
 
 import dataclasses
 import json
-import math
 import shutil
-import time
 from contextlib import ExitStack, closing, suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -16,35 +14,29 @@ from typing import Any
 
 import torch
 from rich.console import Console
-from stable_baselines3.common.callbacks import BaseCallback
 
-from rmc.actors.config import EvaluatorConfig
-from rmc.actors.evaluator import Rollout, evaluation_record, first_start, play_episodes
+from rmc.actors.evaluator import evaluation_record, first_start, play_episodes
 from rmc.analysis.baseline_model import PROGRESS, BaselineModel, saved_player, saved_states
+from rmc.analysis.baseline_run import BaselineRun, Stopped, evaluated_steps, initial_return
 from rmc.analysis.baseline_settings import BaselineConfig, read_config, validate
-from rmc.analysis.evaluation import FINAL_EPISODES, EvaluationProgress, Watch, missing_shares
+from rmc.analysis.evaluation import Watch, missing_shares
 from rmc.common.bus.metrics_record import is_complete
 from rmc.common.env.make import env_layout, make_env
 from rmc.common.errors import STOPPED_STATUS, ConfigError
 from rmc.common.process.role import StopSignal
 from rmc.common.return_text import return_text
-from rmc.common.whole_file import NO_ROOM, write_whole
-from rmc.deploy.monitor import main_metrics
-from rmc.deploy.monitor.metrics_log import MetricsLog
+from rmc.common.whole_file import write_whole
 from rmc.deploy.run.env_sizes import layout_sizes
-from rmc.deploy.run.folder import ROOM_SECONDS, RunFolder, read_object
+from rmc.deploy.run.folder import RunFolder, read_object
 from rmc.deploy.run.launch_options import LaunchOptions
-from rmc.deploy.run.metrics_tail import MetricsTail, wall_seconds
 from rmc.deploy.run.migrations import FORMAT
 from rmc.deploy.run.opening import default_name, forget_start, has_more_than_a_start, make, new_folder
-from rmc.deploy.run.option_names import changes, flat, option
+from rmc.deploy.run.option_names import changes, option
 from rmc.deploy.run.starts import note_start, resume_command
 from rmc.deploy.run.state import remedy
 from rmc.deploy.run.validation import validate_new_env
 
 MAY_CHANGE = {"total_steps", "threads", "checkpoint_steps", "episodes", "env.env_timeout"}
-SAVE_SECONDS = 120.0  # between states that can be gone on with: a replay buffer is large
-RECORD_SECONDS = 5.0
 Changes = dict[str, list[Any]]  # by the option's path, what it was and is
 
 
@@ -76,7 +68,7 @@ def _newest_state(folder: RunFolder, console: Console) -> Path | None:
         return states[-1]
     if folder.result() is not None:
         raise ConfigError("RUN", str(folder.path), "has lost its checkpoint; restore it, or take another --run-dir")
-    if steps := _evaluated_steps(folder):  # killed before it was saved
+    if steps := evaluated_steps(folder):  # killed before it was saved
         console.print(f"no checkpoint is there of the {steps:,} steps before; they begin anew", soft_wrap=True)
     return None
 
@@ -93,7 +85,7 @@ def _conduct(
     if (result := folder.result()) is not None and is_complete(result):  # no step is missing: it would be gone else
         return _print_end(folder, result, console)
     result, steps = None, 0
-    with suppress(_Stopped), closing(_Run(config, folder, model, console, stop)) as run:
+    with suppress(Stopped), closing(BaselineRun(config, folder, model, console, stop)) as run:
         run.train()
         steps = run.steps
         result = None if stop.requested else run.result()
@@ -127,7 +119,7 @@ def _open_folder(config: BaselineConfig, run_dir: Path | None, sizes: dict[str, 
         raise ConfigError(name, now, fix)
     if there:
         folder.check_sizes(config.env.id, sizes)
-        _initial_return(folder)
+        initial_return(folder)
     elif has_more_than_a_start(folder):
         raise ConfigError("--run-dir", str(folder.path), "is there and is no baseline's; give another one")
     make(folder)
@@ -146,156 +138,6 @@ def _write_start(config: BaselineConfig, folder: RunFolder, sizes: dict[str, Any
     write_whole(folder.path / "config.json", f"{written}\n".encode())
     folder.write_sizes(sizes)
     folder.reopen(config.total_steps)
-
-
-class _Stopped(Exception):
-    """Amid an evaluation, by the signal."""
-
-
-class _Run(BaseCallback):
-    """A model between its environment and its folder: evaluates, records, saves, stops. Raises _Stopped."""
-
-    def __init__(
-        self, config: BaselineConfig, folder: RunFolder, model: BaselineModel, console: Console, stop: StopSignal
-    ) -> None:
-        super().__init__()
-        self.config, self.folder, self._console, self._stop = config, folder, console, stop
-        self._model = model
-        self._full = False  # the disk, when it was saved last
-        self._began, self._wall_before = time.monotonic(), wall_seconds(folder.metrics)
-        self._save_at, self._record_at = time.monotonic() + SAVE_SECONDS, math.inf
-        self._next_evaluation = self._after(min(self.steps, _evaluated_steps(folder)))  # one that was cut is made up
-        self._initial = self._first_evaluation()
-        self._metrics, self._record_at = MetricsLog(folder, flat(config)), 0.0
-
-    @property
-    def steps(self) -> int:
-        """Agent steps so far."""
-        return self._model.steps
-
-    # Training
-
-    def train(self) -> None:
-        """To the end or the signal; what is not saved then is saved."""
-        missing = self.config.total_steps - self.steps
-        if missing > 0:
-            with suppress(_Stopped):
-                self._model.sb3.learn(missing, self, reset_num_timesteps=False, log_interval=None)
-        while not self._saved() and not self._stop.requested:
-            time.sleep(ROOM_SECONDS)
-        self._write_progress(finished=self.steps >= self.config.total_steps)
-        self._record_at = math.inf  # the last evaluation is no training time
-
-    def close(self) -> None:
-        self._metrics.close()
-
-    def _on_step(self) -> bool:
-        now = time.monotonic()
-        self._speak()
-        if self.num_timesteps >= self._next_evaluation:
-            self._next_evaluation = self._after(self.num_timesteps)
-            self._evaluate()
-            if now >= self._save_at and self._saved():
-                self._save_at = time.monotonic() + SAVE_SECONDS
-        return not self._stop.requested
-
-    def _saved(self) -> bool:
-        """Save; whether there was room. It is said once where there was none."""
-        try:
-            self._model.save(self.folder)
-        except OSError as error:
-            if error.errno not in NO_ROOM:
-                raise
-            if not self._full:
-                self._console.print(f"{self.folder.checkpoints} finds no room; make some", soft_wrap=True)
-            self._full = True
-            return False
-        self._full = False
-        return True
-
-    def _after(self, steps: int) -> int:
-        return (steps // self.config.checkpoint_steps + 1) * self.config.checkpoint_steps
-
-    # Evaluation and records
-
-    def _play(self, episodes: int, final: bool, model: BaselineModel | None = None) -> dict[str, Any]:
-        player, seed = (model or self._model).player(), first_start(self.config.seed, final)
-        progress = EvaluationProgress(self._console, f"evaluation at step {self.steps:,}")
-
-        def watch(rollout: Rollout) -> None:
-            progress(rollout)
-            self._speak()
-            if self._stop.requested:
-                raise _Stopped
-
-        seconds = EvaluatorConfig.evaluation_seconds
-        return evaluation_record(
-            play_episodes(player, lambda: make_env(self.config.env), episodes, seed, seconds, watch)
-        )
-
-    def _first_evaluation(self) -> float:
-        """Of what it was before any training, once for the folder."""
-        if (kept := _initial_return(self.folder)) is not None:
-            return kept
-        if self.steps == 0:
-            played = self._play(FINAL_EPISODES, final=True)
-        else:  # that file was removed since
-            with closing(BaselineModel(self.config, None)) as new:
-                played = self._play(FINAL_EPISODES, final=True, model=new)
-        self.folder.write_initial(played)
-        return float(played["eval_return_mean"])
-
-    def _evaluate(self) -> None:
-        result = self._play(self.config.episodes, final=False)
-        self._write_progress()
-        self._write("evaluator", {**result, "eval_update": self._model.updates, "eval_env_steps": self.steps})
-        returns = return_text(result["eval_return_mean"], result["eval_return_std"])
-        self._console.print(f"step {self.steps:,}: return {returns}, {self._wall():,.0f} s")
-
-    def _speak(self) -> None:
-        """Say now and then how far it is: who says nothing for long is taken for hanging."""
-        now = time.monotonic()
-        if now >= self._record_at:
-            self._record_at = now + RECORD_SECONDS
-            self._write_progress()
-
-    def _write_progress(self, finished: bool = False) -> None:
-        self._write("launcher", {"wall_s": self._wall()})
-        self._write("learner", {"env_steps": self.steps, "updates": self._model.updates, "finished": int(finished)})
-
-    def _write(self, role: str, record: dict[str, Any]) -> None:
-        record = {"role": role, "time": time.time(), **record}
-        self._metrics.write(record, self.steps, main_metrics.evaluation_metrics(record))
-
-    def _wall(self) -> float:
-        return self._wall_before + time.monotonic() - self._began
-
-    def result(self) -> dict[str, Any]:
-        """As that of ``rmc train``."""
-        wall_s = self._wall()
-        return {
-            "env": self.config.env.id,
-            "preset": self.config.name,
-            "seed": self.config.seed,
-            "env_steps": self.steps,
-            "updates": self._model.updates,
-            **self._play(FINAL_EPISODES, final=True),
-            **missing_shares(self.config.env),
-            "initial_return_mean": self._initial,
-            "wall_s": wall_s,
-        }
-
-
-def _initial_return(folder: RunFolder) -> float | None:
-    """Of what it was before any training, if that was played. Raises ConfigError where the file is damaged."""
-    file = folder.initial_file
-    return float(read_object(file, "eval_return_mean")["eval_return_mean"]) if file.exists() else None
-
-
-def _evaluated_steps(folder: RunFolder) -> int:
-    """Agent steps at the last evaluation; 0 before the first."""
-    said = (record.get("eval_env_steps") for record in MetricsTail(folder.metrics).take())
-    return max((steps for steps in said if isinstance(steps, int)), default=0)
 
 
 def evaluate(

@@ -5,7 +5,7 @@
 
 Takes about 15 minutes on two quiet cores. --record adds its lines to benchmarks/results/guard.jsonl. The return is the
 mean of a run's last three evaluations. Speed is updates a second over GFLOP/s of the update's own products. Those are
-timed before and after the run: a slow hour slows both.
+timed before and after the run: a slow hour slows both. Lines of another kind of machine say nothing about speed.
 """
 
 import argparse
@@ -44,6 +44,7 @@ EVALUATIONS = 3  # the last ones, of which the return is the mean
 WARM = 1_000  # updates before speeds count
 RETURN_TOLERANCE = 0.2  # of the least return that a line has: few seeds leave much to chance
 SPEED_TOLERANCE = 0.9  # of the lines' median
+LIKE_MACHINE = 1.25  # GFLOP/s beyond that ratio are another machine's: an update is not products alone
 PRODUCT = 240, 400, 300  # rows, inputs, outputs: a layer of robust's heads
 PRODUCT_SECONDS = 3.0
 
@@ -102,12 +103,15 @@ def faults(line: Line, before: Iterable[Line]) -> list[str]:
     before = [one for one in before if one.task == line.task]
     if not before:
         return ["nothing to compare with; --record makes a first line"]
-    least, usual = min(one.episode_return for one in before), statistics.median(one.speed for one in before)
+    least = min(one.episode_return for one in before)
     worse, bound = [], least - RETURN_TOLERANCE * abs(least)
     if not line.episode_return >= bound:  # nor where it is no number
         worse.append(f"return below {bound:,.1f}; the least of {len(before)} lines is {least:,.1f}")
-    if not line.speed >= SPEED_TOLERANCE * usual:
-        worse.append(f"speed below {SPEED_TOLERANCE:.0%} of {usual:,.1f}, the median of {len(before)} lines")
+    speeds = [one.speed for one in before if 1 / LIKE_MACHINE <= one.gflops / line.gflops <= LIKE_MACHINE]
+    if not speeds:
+        worse.append(f"no line is of a machine of about {line.gflops:,.0f} GFLOP/s; --record makes a first one")
+    elif not line.speed >= SPEED_TOLERANCE * (usual := statistics.median(speeds)):
+        worse.append(f"speed below {SPEED_TOLERANCE:.0%} of {usual:,.1f}, the median of {len(speeds)} lines")
     return worse
 
 

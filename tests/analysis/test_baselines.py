@@ -20,7 +20,7 @@ from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from rmc import api
-from rmc.analysis import baseline_settings, baselines
+from rmc.analysis import baseline_run, baseline_settings, baselines
 from rmc.analysis.baseline_model import BaselineModel
 from rmc.analysis.baseline_settings import Algorithm, BaselineConfig, Settings, choose, read_config
 from rmc.analysis.baselines import evaluate, train
@@ -114,14 +114,14 @@ def test_every_one_trains_stops_and_goes_on(algorithm, tmp_path):
 
 def test_its_last_evaluation_is_no_training_time(tmp_path, monkeypatch):
     played, scores = [], {"eval_return_mean": 1.0, "eval_return_std": 0.0, "eval_episodes": 1}
-    monkeypatch.setattr(baselines._Run, "_play", lambda *_, **__: played.append(1) or scores)
-    monkeypatch.setattr(baselines._Run, "_wall", lambda _: float(len(played)))
+    monkeypatch.setattr(baseline_run.BaselineRun, "_play", lambda *_, **__: played.append(1) or scores)
+    monkeypatch.setattr(baseline_run.BaselineRun, "_wall", lambda _: float(len(played)))
     assert run(config(), tmp_path / "run") == 0
     assert RunFolder(tmp_path / "run").result()["wall_s"] == len(played) - 1
 
 
 def test_it_speaks_while_it_plays(tmp_path, monkeypatch):
-    monkeypatch.setattr(baselines, "RECORD_SECONDS", 0.0)
+    monkeypatch.setattr(baseline_run, "RECORD_SECONDS", 0.0)
     assert run(config(), tmp_path / "run") == 0
     folder = RunFolder(tmp_path / "run")
     records = list(folder.records())
@@ -365,8 +365,8 @@ def test_a_full_disk_is_waited_out(tmp_path, monkeypatch, capsys):
             raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(BaselineModel, "_write", full)
-    monkeypatch.setattr(baselines, "SAVE_SECONDS", 0.0)
-    monkeypatch.setattr(baselines, "ROOM_SECONDS", 0.0)
+    monkeypatch.setattr(baseline_run, "SAVE_SECONDS", 0.0)
+    monkeypatch.setattr(baseline_run, "ROOM_SECONDS", 0.0)
     assert train(config(), folder, Console(width=400), StopSignal()) == 0
     assert capsys.readouterr().out.count("finds no room") == 1
     assert [path.name for path in (folder / "checkpoints").iterdir()] == ["000000000300"]
@@ -378,10 +378,10 @@ def test_an_evaluation_that_was_stopped_is_made_up(tmp_path, monkeypatch):
 
     def stopped(*_):
         stop.request()
-        raise baselines._Stopped
+        raise baseline_run.Stopped
 
     with monkeypatch.context() as patch:
-        patch.setattr(baselines._Run, "_evaluate", stopped)
+        patch.setattr(baseline_run.BaselineRun, "_evaluate", stopped)
         assert run(config(), folder.path, stop) == 130
     assert "eval_env_steps" not in folder.metrics.read_text()
     assert run(config(), folder.path) == 0
