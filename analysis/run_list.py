@@ -89,8 +89,9 @@ def table(summaries: Sequence[RunSummary], folder: Path, width: int) -> Table:
 
 def _cells(one: RunSummary, folder: Path) -> dict[str, str | Text]:
     done = min(1.0, one.env_steps / one.total_steps) if one.env_steps is not None and one.total_steps else None
+    name = os.path.relpath(one.run, folder)
     return {
-        "run": os.path.relpath(one.run, folder),
+        "run": name if name != os.curdir else Path(one.run).resolve().name,
         "state": Text(one.state, STYLES.get(one.state, "red")),
         "steps": number(one.env_steps, ","),
         "return": known_return(one.eval_return),

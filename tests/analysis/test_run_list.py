@@ -109,6 +109,9 @@ def test_a_folder_without_runs_is_said(tmp_path: Path) -> None:
         runs(tmp_path / "nowhere")
 
 
-def test_a_folder_that_is_a_run_is_listed(root: Path) -> None:
-    assert [one.state for one in runs(root / "finished")] == ["finished"]
-    assert isinstance(runs(root / "finished")[0], RunSummary)
+def test_a_folder_that_is_a_run_is_listed_by_its_name(root: Path) -> None:
+    (one,) = runs(root / "finished")
+    assert (type(one), one.state) == (RunSummary, "finished")
+    console = Console(file=io.StringIO(), width=80)
+    console.print(table([one], root / "finished", 80))
+    assert console.file.getvalue().splitlines()[1].startswith("finished  finished")  # type: ignore[attr-defined]
