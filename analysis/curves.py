@@ -117,7 +117,7 @@ def draw_agent(panel: Any, curves: list[Line], index: int) -> Any:
     places = np.linspace(low, high, POINTS)
     returns = np.stack([np.interp(places, *one) for one in curves])  # (R, POINTS)
     line = panel.plot(places, [interquartile_mean(at) for at in returns.T], **style)[0]
-    bands = [interval(interquartile_mean, at[:, None], resamples=CURVE_RESAMPLES) for at in returns.T]
+    bands = [interval(at, CURVE_RESAMPLES) for at in returns.T]
     panel.fill_between(places, *np.transpose(bands), color=style["color"], alpha=0.2, linewidth=0)
     return line
 
@@ -142,8 +142,8 @@ def _named(agent: str, groups: Groups, by: Axis) -> str:
 
 
 def last_returns(runs: list[History]) -> Scores:
-    """(R, 1): of every run's last evaluation."""
-    return np.array([[run.evaluations[-1].return_mean] for run in runs])
+    """(R,): of every run's last evaluation."""
+    return np.array([run.evaluations[-1].return_mean for run in runs])
 
 
 def tables(groups: Groups, reference: str | None) -> list[Table]:
@@ -180,13 +180,13 @@ def cells(runs: list[History]) -> list[str]:
 def _returns(runs: list[History]) -> str:
     scores = last_returns(runs)
     if len(runs) >= ENOUGH_SEEDS:
-        low, high = interval(interquartile_mean, scores)
+        low, high = interval(scores)
         return f"{return_text(_centre(scores))} [{return_text(low)}, {return_text(high)}]"
-    return f"{return_text(_centre(scores))} ({', '.join(map(return_text, scores[:, 0]))})"
+    return f"{return_text(_centre(scores))} ({', '.join(map(return_text, scores))})"
 
 
 def _centre(scores: Scores) -> float:
-    """(R, 1) -> the return that is shown of R runs."""
+    """(R,) -> the return that is shown of R runs."""
     return interquartile_mean(scores) if len(scores) >= ENOUGH_SEEDS else float(scores.mean())
 
 

@@ -1,10 +1,8 @@
 """Few runs told honestly: interquartile means, bootstrap intervals, the probability that one agent beats another.
 
 As Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice" (2021), define them.
-Shapes: R runs (seeds), E environments; a score matrix is (R, E).
+Shapes: R runs (seeds).
 """
-
-from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,20 +20,15 @@ def interquartile_mean(scores: Scores) -> float:
     return float(ordered[cut : len(ordered) - cut].mean())
 
 
-def interval(statistic: Callable[[Scores], float], scores: Scores, resamples: int = RESAMPLES) -> tuple[float, float]:
-    """Percentile bootstrap of a statistic of (R, E) scores, runs drawn anew within each environment."""
-    random = np.random.default_rng(0)
-    estimates = [statistic(_resampled(scores, random)) for _ in range(resamples)]
+def interval(scores: Scores, resamples: int = RESAMPLES) -> tuple[float, float]:
+    """Percentile bootstrap of the interquartile mean of (R,) scores."""
+    random, runs = np.random.default_rng(0), len(scores)
+    estimates = [interquartile_mean(scores[random.integers(0, runs, runs)]) for _ in range(resamples)]
     low, high = np.quantile(estimates, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
     return float(low), float(high)
 
 
-def _resampled(scores: Scores, random: np.random.Generator) -> Scores:
-    drawn = random.integers(0, scores.shape[0], scores.shape)
-    return np.take_along_axis(scores, drawn, axis=0)
-
-
 def probability_of_improvement(scores: Scores, others: Scores) -> float:
-    """P(a run of the first scores above one of the second), ties a half, mean over environments: (R, E), (R', E)."""
+    """P(a run of the first scores above one of the second), ties a half: (R,), (R',)."""
     above = np.sign(scores[:, None] - others[None, :])
     return float((0.5 + 0.5 * above).mean())

@@ -55,10 +55,10 @@ def report(path: Path) -> None:
     for line in objects(path, "agent", "env", "returns").values():
         by_agent.setdefault((line["env"], line["agent"]), []).append(area(line["returns"]))
     for (env, agent), areas in by_agent.items():
-        scores = np.array(areas)[:, None]
+        scores = np.array(areas)
         text = f"{env}, {agent}: {scores.mean():,.0f} ({', '.join(f'{one:,.0f}' for one in areas)})"
         if len(areas) >= ENOUGH_SEEDS:
-            low, high = interval(interquartile_mean, scores)
+            low, high = interval(scores)
             text += f"; interquartile mean {interquartile_mean(scores):,.0f} [{low:,.0f}, {high:,.0f}]"
         print(text)
 

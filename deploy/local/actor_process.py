@@ -13,7 +13,7 @@ from rmc.common.bus.protocol import Bus, actor_role
 from rmc.common.env.wrappers import Env
 from rmc.common.errors import ConfigError
 from rmc.common.process.role import run_role
-from rmc.deploy.local.role_process import Process, RunConnection
+from rmc.deploy.local.role_context import RoleContext, RunConnection
 from rmc.deploy.run.config import RunConfig
 from rmc.learner.initial_priority import InitialPriority
 
@@ -24,7 +24,7 @@ EVALUATOR_NICENESS = 10  # it must not take the learner's core
 
 def run_actor(connection: RunConnection, index: int) -> int:
     """The process of actor ``index``."""
-    process = Process(connection)
+    process = RoleContext(connection)
     config = process.config
     if not 0 <= index < config.actors:
         raise ConfigError("--index", index, f"the run has actors 0 to {config.actors - 1}")
@@ -55,7 +55,7 @@ def make_evaluator(
 
 def run_evaluator(connection: RunConnection) -> int:
     """The evaluator's process."""
-    process = Process(connection)
+    process = RoleContext(connection)
     config = process.config
     torch.set_num_threads(1)
     os.nice(EVALUATOR_NICENESS)

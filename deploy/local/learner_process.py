@@ -14,7 +14,7 @@ from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import BusFull, BusUnavailable
 from rmc.common.process.role import run_role
 from rmc.common.replay import Replay
-from rmc.deploy.local.role_process import Process, RunConnection, until_taken
+from rmc.deploy.local.role_context import RoleContext, RunConnection, until_taken
 from rmc.deploy.run import tls
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.host import cores
@@ -26,7 +26,7 @@ from rmc.learner.replay.sharded import ShardedReplay
 
 def run_learner(connection: RunConnection, folder: Path, device: str) -> int:
     """The learner's process; checkpoints go to ``folder``. Its last record says ``finished`` where the run is."""
-    secret, process = connection.secret(), Process(connection)
+    secret, process = connection.secret(), RoleContext(connection)
     config, spec, bus = process.config, process.config.window_spec(), process.bus
     torch.set_num_threads(1)  # until it is known whether the model's half has a process, and what is fastest
     check_device(device)

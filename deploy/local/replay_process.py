@@ -6,7 +6,7 @@ from rmc.common.bus.protocol import Bus, ReplayOwner
 from rmc.common.errors import ConfigError
 from rmc.common.process.role import run_role
 from rmc.common.shard import Shard
-from rmc.deploy.local.role_process import Process, RunConnection
+from rmc.deploy.local.role_context import RoleContext, RunConnection
 from rmc.deploy.run import tls
 from rmc.deploy.run.config import RunConfig
 from rmc.replay_server.process import ReplayProcess
@@ -29,7 +29,7 @@ def drop_unread(bus: Bus, shard: Shard) -> None:
 
 def run_replay(connection: RunConnection, folder: Path, listen: str, index: int) -> int:
     """A replay server's process; its ring lies in ``folder``, its socket at ``listen``."""
-    secret, process = connection.secret(), Process(connection)
+    secret, process = connection.secret(), RoleContext(connection)
     config, shard = process.config, Shard(index, process.config.replay.replay_shards)
     if not 0 <= index < shard.count:
         raise ConfigError("--shard", index, f"the run has replay servers 0 to {shard.count - 1}")

@@ -14,7 +14,7 @@ from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
 from rmc.common.errors import RoleDied
 from rmc.common.shard import WHOLE
 from rmc.deploy.local.role_environment import URL_VARIABLE, working_folder
-from rmc.deploy.local.supervisor import QUICK_DEATHS
+from rmc.deploy.local.role_process import QUICK_DEATHS
 from rmc.deploy.ray.placement import LEARNER, RolePlacement, groups, nodes_by_room, places
 from rmc.deploy.ray.ring_nodes import RingLocations
 from rmc.deploy.ray.role_actor import NAMESPACE, Task, actor_name, is_for_now

@@ -14,7 +14,8 @@ from ray.util.placement_group import placement_group_table, remove_placement_gro
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.errors import RmcError
 from rmc.common.whole_file import write_whole
-from rmc.deploy.local.supervisor import HELD_SECONDS, QUICK_DEATHS, QUICK_SECONDS
+from rmc.deploy.local.role_process import QUICK_DEATHS, QUICK_SECONDS
+from rmc.deploy.local.supervisor import HELD_SECONDS
 from rmc.deploy.monitor import attach
 from rmc.deploy.monitor.recorded import recorded_status
 from rmc.deploy.ray.role_actor import NAMESPACE, RoleActor, Task, actor_name

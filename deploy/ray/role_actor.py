@@ -17,7 +17,7 @@ from rmc.common.errors import CONFIG_STATUS, CheckpointError
 from rmc.common.process import descendants
 from rmc.common.whole_file import NO_ROOM, write_private
 from rmc.deploy.local.role_command import RoleCommand
-from rmc.deploy.local.supervisor import NO_PROCESS, RoleProcess
+from rmc.deploy.local.role_process import NO_PROCESS, RoleProcess
 from rmc.deploy.ray.node import leave_rays_worker, private_folder
 
 NAMESPACE = "rmc"

@@ -10,7 +10,7 @@ from typing import Any
 import ray
 
 from rmc.deploy.local.fork_server import open_log
-from rmc.deploy.local.supervisor import QuickDeaths
+from rmc.deploy.local.role_process import QuickDeaths
 from rmc.deploy.ray.role_actor import RoleReport
 
 POLL_SECONDS = 0.5  # between questions to each host

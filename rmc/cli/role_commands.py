@@ -8,8 +8,8 @@ import sys
 from rmc.cli import signals, training
 from rmc.cli.role_options import ActorRole, EvaluatorRole, LauncherRole, ReplayRole, Role
 from rmc.common.errors import ConfigError
+from rmc.deploy.local.role_context import RunConnection
 from rmc.deploy.local.role_environment import SECRET_VARIABLE, URL_VARIABLE
-from rmc.deploy.local.role_process import RunConnection
 from rmc.deploy.monitor.view import terminal
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.starts import last_launch

@@ -23,7 +23,7 @@ from rmc.common.bus.redis_bus import DEAD_LETTERS_KEPT, RECORDS_READ, RedisBus
 from rmc.common.bus.weight_store import PIECE_BYTES, UNPUBLISHED_SECONDS
 from rmc.common.errors import BusFull, BusUnavailable, ConfigError, FencedError
 from rmc.common.process.role import StopSignal
-from rmc.deploy.local.role_process import until_taken
+from rmc.deploy.local.role_context import until_taken
 from rmc.deploy.redis.server import RedisServer
 
 

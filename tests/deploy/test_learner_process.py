@@ -15,7 +15,7 @@ from rmc.common.env.config import EnvConfig
 from rmc.common.process.role import StopSignal
 from rmc.deploy.local import learner_process
 from rmc.deploy.local.learner_process import run_learner
-from rmc.deploy.local.role_process import RunConnection
+from rmc.deploy.local.role_context import RunConnection
 from rmc.deploy.redis.registration import Registration
 from rmc.deploy.redis.server import RedisServer
 from rmc.deploy.run.folder import RunFolder

@@ -19,7 +19,7 @@ from rmc.common.errors import BusUnavailable, ConfigError
 from rmc.common.process.role import StopSignal
 from rmc.common.replay import ObservationStatistics
 from rmc.deploy.local import launcher
-from rmc.deploy.local.role_process import Process
+from rmc.deploy.local.role_context import RoleContext
 from rmc.deploy.monitor.monitor import Monitor
 from rmc.deploy.redis import connect, registration
 from rmc.deploy.redis.registration import Registration
@@ -191,7 +191,7 @@ def test_a_role_whose_environment_has_other_sizes_than_the_launchers_does_not_be
 ) -> None:
     bus, config = RedisBus(redis_url, run_name), debug(EnvConfig("tests.habits:Slide-v0"))
     Registration(config, RunFolder(tmp_path), bus)
-    role = Process.__new__(Process)
+    role = RoleContext.__new__(RoleContext)
     role.config = from_registration(bus.config() or b"")
     assert role.config == config
     role.make_env().close()

@@ -15,10 +15,11 @@ from rmc.common.env.process_state import ApartCall
 from rmc.common.errors import RoleDied
 from rmc.common.process.role import TERMINATED_STATUS
 from rmc.common.process.watchdog import HUNG_STATUS
-from rmc.deploy.local import supervisor
+from rmc.deploy.local import role_process, supervisor
 from rmc.deploy.local.fork_server import ForkServer
 from rmc.deploy.local.role_command import RoleCommand
-from rmc.deploy.local.supervisor import QuickDeaths, RoleProcess, Supervisor
+from rmc.deploy.local.role_process import QuickDeaths, RoleProcess
+from rmc.deploy.local.supervisor import Supervisor
 from tests.waiting import wait_until
 
 
@@ -28,8 +29,8 @@ def quick(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     program = tmp_path / "program"
     program.write_text("#!/bin/sh\nexit 0\n")
     program.chmod(0o700)
-    monkeypatch.setattr(supervisor.sys, "executable", str(program))
-    monkeypatch.setattr(supervisor, "FIRST_BACKOFF", 0.01)
+    monkeypatch.setattr(sys, "executable", str(program))
+    monkeypatch.setattr(role_process, "FIRST_BACKOFF", 0.01)
     return tmp_path
 
 
@@ -39,7 +40,7 @@ def tend_until(role: RoleProcess, seconds: float = 5.0) -> None:
 
 def variables_of_a_role(quick: Path, **variables: str) -> dict[str, str]:
     """What a role is started with, these among them."""
-    Path(supervisor.sys.executable).write_text(f"#!/bin/sh\nenv > {quick}/told\n")
+    Path(sys.executable).write_text(f"#!/bin/sh\nenv > {quick}/told\n")
     role = RoleProcess(RoleCommand("learner", ("learner",), ends=True), variables, quick)
     role.start()
     tend_until(role)
@@ -84,7 +85,7 @@ def test_what_an_environment_sets_for_itself_is_not_passed_on(quick: Path, monke
 
 def test_a_role_starts_where_the_working_folder_is_gone(quick: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In one that is there: MKL, for one, is not loaded in one that is not."""
-    Path(supervisor.sys.executable).write_text(f"#!/bin/sh\npwd -P > {quick}/told\n")
+    Path(sys.executable).write_text(f"#!/bin/sh\npwd -P > {quick}/told\n")
     (gone := quick / "gone").mkdir()
     monkeypatch.chdir(gone)
     gone.rmdir()
@@ -129,7 +130,7 @@ def test_the_interpreters_words_of_a_hang_are_its_last(quick: Path) -> None:
 
 
 def test_an_earlier_starts_words_are_not_its_last(quick: Path) -> None:
-    Path(supervisor.sys.executable).write_text("#!/bin/sh\necho new\n")
+    Path(sys.executable).write_text("#!/bin/sh\necho new\n")
     role = RoleProcess(RoleCommand("learner", ("learner",), ends=True), {}, quick)
     role.log.write_text("Traceback (most recent call last)\nold\n")
     role.start()
@@ -139,8 +140,8 @@ def test_an_earlier_starts_words_are_not_its_last(quick: Path) -> None:
 
 def test_each_quick_death_doubles_the_wait(quick: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Not so one that others have ended."""
-    monkeypatch.setattr(supervisor, "FIRST_BACKOFF", 0.25)
-    monkeypatch.setattr(supervisor, "time", SimpleNamespace(monotonic=lambda: 100.0))
+    monkeypatch.setattr(role_process, "FIRST_BACKOFF", 0.25)
+    monkeypatch.setattr(role_process, "time", SimpleNamespace(monotonic=lambda: 100.0))
     role, waits = RoleProcess(RoleCommand("actor-0", ("actor",)), {}, quick), []
     role._started_at = 99.0
     for status in (1, 1, -9, 1):
@@ -151,7 +152,7 @@ def test_each_quick_death_doubles_the_wait(quick: Path, monkeypatch: pytest.Monk
 
 def test_what_a_role_has_started_goes_before_it_is_started_again(quick: Path) -> None:
     """Else two of its environments' simulators would have one port, or one display."""
-    Path(supervisor.sys.executable).write_text(f"#!/bin/sh\nsleep 60 &\necho $! >> {quick}/pids\nexit 0\n")
+    Path(sys.executable).write_text(f"#!/bin/sh\nsleep 60 &\necho $! >> {quick}/pids\nexit 0\n")
     role = RoleProcess(RoleCommand("learner", ("learner",), ends=True), {}, quick)
     role.start()
     tend_until(role)
@@ -163,7 +164,7 @@ def test_what_a_role_has_started_goes_before_it_is_started_again(quick: Path) ->
 @pytest.mark.parametrize("ends", [False, True])
 def test_a_role_that_others_kill_is_started_again_however_often(quick: Path, end: str, ends: bool) -> None:
     """The learner, too, whose end in order is that of the run."""
-    Path(supervisor.sys.executable).write_text(f"#!/bin/sh\n{end}\n")
+    Path(sys.executable).write_text(f"#!/bin/sh\n{end}\n")
     role = RoleProcess(RoleCommand("role", ("role",), ends=ends), {}, quick)
     role.start()
     wait_until(lambda: role.tend() or role.restarts >= 10, 20.0, pause=0.001)
@@ -173,7 +174,7 @@ def test_a_role_that_others_kill_is_started_again_however_often(quick: Path, end
 
 
 def test_a_role_that_crashes_ends_the_run(quick: Path) -> None:
-    Path(supervisor.sys.executable).write_text("#!/bin/sh\nkill -11 $$\n")
+    Path(sys.executable).write_text("#!/bin/sh\nkill -11 $$\n")
     role = RoleProcess(RoleCommand("actor-0", ("actor",)), {}, quick)
     role.start()
     with pytest.raises(RoleDied, match=r"3 times in a row soon after its start, killed by signal 11"):
@@ -185,7 +186,7 @@ def test_a_learner_that_saves_for_long_is_not_killed_and_others_are(
 ) -> None:
     """The replay server, which it may need, is told only then."""
     output = quick / "said"
-    program = Path(supervisor.sys.executable)
+    program = Path(sys.executable)
     program.write_text(ENDING.replace("SAID", str(output)))
     monkeypatch.setattr(supervisor, "STOP_SECONDS", 1.0)
     commands = [RoleCommand(name, (name,), forked=False) for name in ("replay", "actor", "learner")]
@@ -211,7 +212,7 @@ while :; do sleep 0.05; done
 
 
 def test_where_no_process_can_be_started_now_it_is_tried_again(quick: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(supervisor, "LONGEST_BACKOFF", 0.01)
+    monkeypatch.setattr(role_process, "LONGEST_BACKOFF", 0.01)
     role = RoleProcess(RoleCommand("learner", ("learner",), ends=True), {}, quick)
     begin, refusals = subprocess.Popen, iter([errno.EAGAIN, errno.ENOMEM])
 
@@ -220,7 +221,7 @@ def test_where_no_process_can_be_started_now_it_is_tried_again(quick: Path, monk
             raise OSError(number, os.strerror(number))
         return begin(*words, **options)
 
-    monkeypatch.setattr(supervisor.subprocess, "Popen", scarce)
+    monkeypatch.setattr(role_process.subprocess, "Popen", scarce)
     assert not role.start_or_wait()
     tend_until(role)
     assert (role.finished, role.restarts) == (True, 1)
@@ -236,7 +237,7 @@ def test_so_it_is_with_the_process_that_forks_roles(tmp_path: Path, monkeypatch:
             raise OSError(number, os.strerror(number))
         start(self)
 
-    monkeypatch.setattr(supervisor, "LONGEST_BACKOFF", 0.01)
+    monkeypatch.setattr(role_process, "LONGEST_BACKOFF", 0.01)
     monkeypatch.setattr(ForkServer, "start", scarce)
     waits = {"RMC_REDIS_URL": "unix:///nowhere", "RMC_PATIENCE": "99"}
     command = RoleCommand("actor-0", ("role", "actor", "--run", "x", "--index", "0"))
@@ -251,6 +252,6 @@ def test_so_it_is_with_the_process_that_forks_roles(tmp_path: Path, monkeypatch:
 
 def test_another_fault_of_a_start_is_told(quick: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     role = RoleProcess(RoleCommand("learner", ("learner",)), {}, quick)
-    monkeypatch.setattr(supervisor.sys, "executable", "/nowhere")
+    monkeypatch.setattr(sys, "executable", "/nowhere")
     with pytest.raises(FileNotFoundError):
         role.tend()

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from rmc.common.checkpoint import STATE, CheckpointFolder
-from rmc.deploy.local.supervisor import QUICK_DEATHS
+from rmc.deploy.local.role_process import QUICK_DEATHS
 from tests.faults.judge import Judgement, judge
 from tests.faults.loaded import ROOMY, Loaded
 from tests.faults.row import Row, at_length

@@ -18,7 +18,7 @@ from rmc.common.errors import BusFull, ConfigError
 from rmc.common.process.role import TERMINATED_STATUS, StopSignal
 from rmc.common.shard import Shard
 from rmc.deploy.local.replay_process import drop_unread
-from rmc.deploy.local.role_process import Process, RunConnection, until_taken
+from rmc.deploy.local.role_context import RoleContext, RunConnection, until_taken
 from rmc.deploy.redis import connect as connecting
 from rmc.deploy.redis.connect import Deadline, connect
 from rmc.deploy.redis.registration import Registration
@@ -49,7 +49,7 @@ def test_one_that_is_ended_while_it_waits_says_so(short: Path, monkeypatch: pyte
     monkeypatch.setattr(connecting, "RECONNECT_SLEEP", 0.0)
     monkeypatch.setattr(connecting.log, "warning", lambda *_: os.kill(os.getpid(), signal.SIGTERM))
     with pytest.raises(SystemExit) as ended:
-        Process(RunConnection("run", f"unix://{short}/redis.sock"))
+        RoleContext(RunConnection("run", f"unix://{short}/redis.sock"))
     assert ended.value.code == TERMINATED_STATUS
 
 
@@ -60,14 +60,14 @@ def test_a_role_waits_for_its_run(
     monkeypatch.setenv("RMC_PATIENCE", "0.3")
     place = RunConnection(run_name, redis_url)
     with pytest.raises(ConfigError, match=f"--run='{run_name}': no run of this name is registered"):
-        Process(place)
+        RoleContext(place)
     assert caplog.messages == [f"waiting up to 0.3 s for run {run_name} to be registered in that Redis"]
     monkeypatch.setenv("RMC_PATIENCE", "60")
     config = debug(EnvConfig("Pendulum-v1"))
     with ThreadPoolExecutor(1) as pool:
         bus, folder = RedisBus(redis_url, run_name), RunFolder(tmp_path)
         later = pool.submit(lambda: (time.sleep(0.5), Registration(config, folder, bus)))
-        assert Process(place).config == config
+        assert RoleContext(place).config == config
         later.result()
 
 
@@ -80,7 +80,7 @@ def test_a_role_of_a_run_that_has_ended_begins_nothing(
     Registration(debug(EnvConfig("Pendulum-v1")), RunFolder(tmp_path), bus)
     bus.request_stop("finished")
     with pytest.raises(SystemExit) as ended:
-        Process(RunConnection(run_name, redis_url))
+        RoleContext(RunConnection(run_name, redis_url))
     assert (ended.value.code, caplog.messages) == (0, [f"run {run_name} has ended: finished"])
 
 
@@ -124,7 +124,7 @@ def test_a_role_that_is_being_made_waits_for_redis(short: Path, run_name: str, t
     with server:
         bus = RedisBus(server.url(), run_name)
         Registration(config, RunFolder(tmp_path), bus)
-        process = Process(RunConnection(run_name, server.url()))
+        process = RoleContext(RunConnection(run_name, server.url()))
         with process.starting("learner"), ThreadPoolExecutor(1) as pool:  # with whose thread the server ends
             server.close()
             later = pool.submit(lambda: (time.sleep(1.0), server.start()))
@@ -163,7 +163,7 @@ def test_a_replay_server_begins_though_its_actors_windows_fill_redis(
         for seq in range(9):
             bus.append(0, EntryId(bus.take_epoch("actor-0") if seq == 0 else 1, seq), bytes(1 << 20))
         client.config_set("maxmemory", client.info()["used_memory"] - 1)
-        process, shard = Process(RunConnection(run_name, server.url())), Shard()
+        process, shard = RoleContext(RunConnection(run_name, server.url())), Shard()
         with process.starting("replay", lambda: drop_unread(process.bus, shard)):
             assert process.bus.take_epoch("replay") == 1
         assert list(bus.read({0: EntryId(1, -1)}, 9)) == []
