@@ -240,11 +240,11 @@ class Actor:
         The former: our epoch is too small (before its first credit one has sent its hello alone). The latter: we
         are granted less than what was acknowledged. Raises FencedError where a newer one is real.
         """
-        ours = self._unacked.epoch
-        if ack.id.epoch != ours:
-            if ack.id.epoch > ours and self._bus.current_epoch(self.name) > ours:
-                raise FencedError(f"{self.name}: epoch {ack.id.epoch} has replaced epoch {ours}")
-            return ack.id.epoch > ours
+        epoch = self._unacked.epoch
+        if ack.id.epoch != epoch:
+            if ack.id.epoch > epoch and self._bus.current_epoch(self.name) > epoch:
+                raise FencedError(f"{self.name}: epoch {ack.id.epoch} has replaced epoch {epoch}")
+            return ack.id.epoch > epoch
         return (self._ack is None and ack.id.seq > 0) or ack.granted_steps < self._unacked.committed_steps
 
     # Stepping
@@ -258,17 +258,17 @@ class Actor:
             action = self._rng.uniform(-1.0, 1.0, action.shape).astype(np.float32)
         if not self._runner.knows_statistics:
             state[:, self._hidden :] = 0.0  # no frame was seen, as nothing normalises it yet
-        given, faults = self._envs.step(action)
+        transitions, faults = self._envs.step(action)
         for i in faults:
             self._builder.end_before(i)
             self._epoch_steps -= 1
             self._total_steps -= 1
-        scaled = given._replace(reward=self._config.reward_scale * given.reward)
+        scaled = transitions._replace(reward=self._config.reward_scale * transitions.reward)
         ended = self._builder.add(action, state, self._version.update, scaled)
         self._next_poll = float("-inf")
         self._epoch_steps += n
         self._total_steps += n
-        self._returns += given.reward
+        self._returns += transitions.reward
         self._lengths += 1
         for env in np.flatnonzero(ended).tolist():
             self._end_episode(env)

@@ -23,7 +23,7 @@ class UnackedEntries:
     came back may have forgotten them. Explicit ids make repeats harmless.
     """
 
-    def __init__(self, bus: Bus, actor: int, epoch: int, spec: WindowSpec, resends: int = 0) -> None:
+    def __init__(self, bus: Bus, actor: int, epoch: int, spec: WindowSpec, resends: int) -> None:
         """``resends`` are those of the epochs before."""
         self._bus, self._actor, self._spec = bus, actor, spec
         self.epoch, self.bytes, self.resends = epoch, 0, resends

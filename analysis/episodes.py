@@ -77,7 +77,7 @@ class RecordFrames(SeenWrapper):
 
 
 def recorded(env: Env) -> tuple[Env, RecordFrames]:
-    """The environment with a Record below all that hides, disturbs or stacks what is seen, and that Record."""
+    """The environment with RecordFrames below all that hides, disturbs or stacks what is seen, and that wrapper."""
     above, inner = None, env
     while isinstance(inner, ObservationSlice | CorruptObservation | Delay | FrameStack):
         above, inner = inner, inner.env

@@ -223,8 +223,8 @@ def wall_seconds(records: Sequence[dict[str, Any]]) -> list[float]:
     Not by time alone: a clock may go back between two starts. ``records``, each with a ``time``, are in the file's
     order, in which one may come a moment late.
     """
-    said = [(one["time"], one["wall_s"]) for one in records if _says(one, "launcher", "time", "wall_s")]
-    known, seconds, before = said or [(0.0, 0.0)], [], 0
+    clock = [(one["time"], one["wall_s"]) for one in records if _says(one, "launcher", "time", "wall_s")]
+    known, seconds, before = clock or [(0.0, 0.0)], [], 0
     for record in records:
         before += _says(record, "launcher", "time", "wall_s")
         time, wall = known[max(before - 1, 0)]

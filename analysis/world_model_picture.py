@@ -4,7 +4,6 @@ Shapes: T steps of the episode, O observation, A action, H hidden, M flags of wh
 Observations are normalised ones.
 """
 
-import io
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +28,7 @@ from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.validation import validate
 from rmc.learner.diagnostics import relative_l1_error
-from rmc.learner.learner_checkpoint import NOT_OURS
+from rmc.learner.learner_checkpoint import NOT_OURS, read_state
 from rmc.learner.losses import model_error
 
 HORIZONS = (1, 5, 15)  # steps ahead
@@ -56,9 +55,9 @@ def load_agent(folder: RunFolder, config: RunConfig, checkpoint: str) -> Agent:
     spec = config.window_spec()
     folder.check_sizes(config.env.id, config.sizes())
     agent = Agent(spec.obs_dim, spec.action_dim, config.agent, spec.missing, spec.privileged)
-    raw = choose_checkpoint(folder, checkpoint)[1][STATE]
+    files = choose_checkpoint(folder, checkpoint)[1]
     try:
-        agent.load_state_dict(torch.load(io.BytesIO(raw), map_location="cpu", weights_only=True)["agent"])
+        agent.load_state_dict(read_state(files, torch.device("cpu"))["agent"])
     except NOT_OURS as error:
         fix = f"its {STATE} is not this run's ({first_line(error)}); use another"
         raise ConfigError("--checkpoint", checkpoint, fix) from None

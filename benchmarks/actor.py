@@ -17,7 +17,8 @@ import torch
 from safetensors.torch import save
 
 from benchmarks import harness
-from benchmarks.harness import ENDLESS, Measure, Row, compare, replay_process, speed, started_peer
+from benchmarks.harness import ENDLESS, Measure, Row, compare, replay_process, started_peer
+from benchmarks.peers.turns import speed
 from rmc.actors.actor import Actor
 from rmc.actors.config import ActorConfig
 from rmc.common.agent import Agent

@@ -9,7 +9,8 @@ from itertools import count, product
 
 import torch
 
-from benchmarks.harness import Row, argument_parser, compare, random_rows, save, speed
+from benchmarks.harness import Row, argument_parser, compare, random_rows, save
+from benchmarks.peers.turns import speed
 from rmc.common.agent import Agent
 from rmc.common.env.config import EnvConfig
 from rmc.deploy.run.config import RunConfig

@@ -17,8 +17,9 @@ import numpy as np
 import torch
 
 from benchmarks import harness
-from benchmarks.harness import Row, compare, random_rows, speed
+from benchmarks.harness import Row, compare, random_rows
 from benchmarks.learner import learner_role, replay_of
+from benchmarks.peers.turns import speed
 from benchmarks.scaling import measure
 from rmc.common.env.config import EnvConfig
 from rmc.common.window import WindowSpec

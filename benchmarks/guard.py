@@ -15,7 +15,6 @@ import shutil
 import statistics
 import subprocess
 import sys
-import time
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -23,6 +22,7 @@ from pathlib import Path
 import torch
 
 from benchmarks.harness import HERE
+from benchmarks.peers.turns import speed
 from benchmarks.update_time import updates_per_s
 from rmc.analysis import history
 from rmc.common.errors import ConfigError
@@ -81,16 +81,17 @@ def trained(task: str, seed: int, code: str) -> Line:
     return Line(task, seed, code, statistics.fmean(returns[-EVALUATIONS:]), speed, (before + gflops()) / 2)
 
 
-def gflops(least_seconds: float = PRODUCT_SECONDS) -> float:
+def gflops() -> float:
     """Of a product like those of an update, on one core, in bfloat16."""
     rows, inputs, outputs = PRODUCT
     x, w = torch.randn(rows, inputs).bfloat16(), torch.randn(inputs, outputs).bfloat16()
-    products, start = 0, time.perf_counter()
-    while (seconds := time.perf_counter() - start) < least_seconds:
+
+    def hundred() -> int:
         for _ in range(100):
             torch.mm(x, w)
-        products += 100
-    return 2e-9 * products * rows * inputs * outputs / seconds
+        return 100
+
+    return 2e-9 * rows * inputs * outputs * speed(hundred, PRODUCT_SECONDS)
 
 
 def committed() -> list[Line]:

@@ -112,14 +112,6 @@ def argument_parser(doc: str | None) -> argparse.ArgumentParser:
     return parser
 
 
-def speed(work: Callable[[], int], seconds: float) -> float:
-    """Units of work a second, ``work`` returning how many it did."""
-    done, start = 0, time.perf_counter()
-    while time.perf_counter() - start < seconds:
-        done += work()
-    return done / (time.perf_counter() - start)
-
-
 class Peer:
     """Another project's code in an environment of its own: a process that measures once for each line it is sent.
 

@@ -31,9 +31,9 @@ from benchmarks.harness import (
     random_rows,
     replay_process,
     save,
-    speed,
     started_peer,
 )
+from benchmarks.peers.turns import speed
 from benchmarks.sender import Sender
 from rmc.common.agent import Agent
 from rmc.common.bus.redis_bus import RedisBus

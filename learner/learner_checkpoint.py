@@ -68,9 +68,15 @@ def _alone(state: Any) -> Any:
     return [_alone(part) for part in state] if isinstance(state, list) else state
 
 
+def read_state(files: Mapping[str, bytes], device: torch.device) -> dict[str, Any]:
+    """A checkpoint's ``JointUpdate.state_dict``, by tensors alone: nothing in it runs. Raises one of NOT_OURS."""
+    state: dict[str, Any] = torch.load(io.BytesIO(files[STATE]), map_location=device, weights_only=True)
+    return state
+
+
 def take_up(files: Mapping[str, bytes], update: JointUpdate, device: torch.device) -> LearnerProgress:
     """Go on from a checkpoint's files, bit for bit. Raises one of NOT_OURS where they are not this run's."""
-    update.load_state_dict(torch.load(io.BytesIO(files[STATE]), map_location=device, weights_only=True))
+    update.load_state_dict(read_state(files, device))
     return LearnerProgress.decode(files[PROGRESS])
 
 

@@ -110,7 +110,7 @@ def observation_loss(expected: Tensor, observation: Tensor, seen: Tensor, m: Ten
     return masked_mean(by_flag, m.unsqueeze(-1) * seen)
 
 
-def priority(td_error: Tensor, eta: float, m: Tensor) -> Tensor:
-    """eta max|td| + (1 - eta) mean|td| over a window's real trained steps; (B, T) -> (B,)."""
-    size = td_error.abs() * m
+def priority(td_size: Tensor, eta: float, m: Tensor) -> Tensor:
+    """eta max|td| + (1 - eta) mean|td| over a window's real trained steps; |td| (B, T) -> (B,)."""
+    size = td_size * m
     return eta * size.max(1).values + (1.0 - eta) * size.sum(1) / m.sum(1).clamp(min=1.0)

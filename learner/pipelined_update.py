@@ -184,9 +184,9 @@ class PipelinedUpdate:
         raw = torch.zeros(self._batch_size, self._spec.dtype.itemsize, dtype=torch.uint8)
         importance, norm = torch.ones(self._batch_size), torch.zeros(())
         with torch.no_grad():
-            made = self._update.model_pass(view_batch(raw, importance, self._spec))[1]  # for its shapes and types
-        metrics = {name: value.clone() for name, value in made.metrics.items()}
-        model = ModelPass._make([*(part.clone() for part in made[:-1]), metrics])  # some are the update's own
+            output = self._update.model_pass(view_batch(raw, importance, self._spec))[1]  # for its shapes and types
+        metrics = {name: value.clone() for name, value in output.metrics.items()}
+        model = ModelPass._make([*(part.clone() for part in output[:-1]), metrics])  # some are the update's own
         slot = Slot(raw, importance, torch.zeros(()), model, norm)
         _share([raw, norm, *model[:-1], *model.metrics.values()])
         return slot

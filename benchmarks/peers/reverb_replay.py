@@ -8,7 +8,6 @@ PLACE: ``server`` (a process of its own) or ``learner`` (in the learner's proces
 import json
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,7 +15,7 @@ import numpy as np
 import reverb
 import tensorflow as tf
 from reverb_table import TABLE, Writer, columns_of, serve
-from turns import pin, take_turns
+from turns import pin, speed, take_turns
 from windows import Columns, Sizes, random_columns, unpack
 
 IMPORTANCE = 0.4
@@ -60,7 +59,7 @@ def main() -> None:
     like, client = random_columns(sizes, 1), reverb.Client(f"localhost:{port}")
     batches, rng = read_dataset(port, batch, in_flight), np.random.default_rng(0)
 
-    def one() -> None:
+    def one() -> int:
         keys, probabilities, windows, columns = next(batches)
         if layout == "packed":
             columns = unpack(columns["row"], like)
@@ -68,18 +67,15 @@ def main() -> None:
         weights = (weights / weights.max()).astype(np.float32)
         priorities = rng.uniform(0.1, 1.0, batch)
         client.mutate_priorities(TABLE, dict(zip(keys.tolist(), priorities.tolist(), strict=True)))
+        return 1
 
     def measure(seconds: float) -> float:
         print(seconds + 0.2, file=sender.stdin, flush=True)
-        begin, done = time.perf_counter(), 0
-        while time.perf_counter() - begin < seconds:
-            one()
-            done += 1
-        speed = done / (time.perf_counter() - begin)
+        batches_per_s = speed(one, seconds)
         came = json.loads(sender.stdout.readline())["value"]
         if came < KEPT_UP * rate:
             raise RuntimeError(f"only {came:.0f} of {rate} windows a second came in")
-        return speed
+        return batches_per_s
 
     one()
     take_turns(measure)

@@ -7,13 +7,12 @@ Answers each line, the seconds to measure for. It has the thread count that was 
 
 import os
 import sys
-import time
 
 import gymnasium as gym
 import torch
 from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import DummyVecEnv
-from turns import take_turns
+from turns import speed, take_turns
 
 TRIAL_SECONDS = 2.0
 
@@ -31,12 +30,12 @@ class Collector:
 
     def speed(self, seconds: float) -> float:
         """Environment steps a second."""
-        steps, start = 0, time.perf_counter()
-        while time.perf_counter() - start < seconds:
-            action, _ = self._model.predict(self._observation, deterministic=False)
-            self._observation, *_ = self._env.step(action)
-            steps += self._envs
-        return steps / (time.perf_counter() - start)
+        return speed(self._step, seconds)
+
+    def _step(self) -> int:
+        action, _ = self._model.predict(self._observation, deterministic=False)
+        self._observation, *_ = self._env.step(action)
+        return self._envs
 
     def with_threads(self, threads: int) -> float:
         """The speed with so many."""

@@ -4,14 +4,14 @@ python sb3_learner.py OBSERVATION ACTION BATCH THREADS
 """
 
 import sys
-import time
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
 import torch
 from stable_baselines3 import SAC
 from stable_baselines3.common.logger import Logger
-from turns import take_turns
+from turns import speed, take_turns
 
 TRANSITIONS = 50_000  # in its buffer
 CHUNK = 10  # gradient steps a call, as it makes them between looks at its environment
@@ -43,15 +43,12 @@ def main() -> None:
         action = draw.uniform(-1.0, 1.0, (1, action_dim)).astype(np.float32)
         model.replay_buffer.add(now, then, action, np.zeros(1, np.float32), np.zeros(1, bool), [{}])
 
-    def measure(seconds: float) -> float:
-        done, start = 0, time.perf_counter()
-        while time.perf_counter() - start < seconds:
-            model.train(gradient_steps=CHUNK, batch_size=batch)
-            done += CHUNK * batch
-        return done / (time.perf_counter() - start)
+    def train() -> int:
+        model.train(gradient_steps=CHUNK, batch_size=batch)
+        return CHUNK * batch
 
-    measure(1.0)
-    take_turns(measure)
+    speed(train, 1.0)
+    take_turns(partial(speed, train))
 
 
 if __name__ == "__main__":

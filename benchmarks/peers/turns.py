@@ -1,4 +1,4 @@
-"""What the peers' scripts share: turns as ``benchmarks/harness.py`` asks for them, and a clock to send by."""
+"""What the peers' scripts share with ours: turns as ``benchmarks/harness.py`` asks for them, a speed, a clock."""
 
 import json
 import os
@@ -12,6 +12,14 @@ def take_turns(measure: Callable[[float], float]) -> None:
     print(json.dumps({"ready": True}), flush=True)
     for line in sys.stdin:
         print(json.dumps({"value": measure(float(line))}), flush=True)
+
+
+def speed(work: Callable[[], int], seconds: float) -> float:
+    """Units of work a second, ``work`` returning how many it did."""
+    done, start = 0, time.perf_counter()
+    while time.perf_counter() - start < seconds:
+        done += work()
+    return done / (time.perf_counter() - start)
 
 
 def pin(core: int) -> None:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-BURN_IN, STEPS = 10, 25
+STEPS = 25
 Columns = dict[str, np.ndarray]
 
 

@@ -1,1 +1,1 @@
-"""What a run says of itself: terminal, metrics log, attaching."""
+"""What a run says of itself: terminal, metrics log, trackers, exporter, films; attaching to it."""

@@ -27,7 +27,7 @@ class SocketFolder:
 
     def __init__(self) -> None:
         place = place_for_sockets()
-        sweep(place)
+        remove_stale(place)
         while True:  # until it is locked before another launcher has swept it
             self.path = Path(tempfile.mkdtemp(prefix=f"{PREFIX}{os.getpid()}-", dir=place))  # its owner's alone
             try:
@@ -86,7 +86,7 @@ def _fits(place: Path) -> bool:
         return False
 
 
-def sweep(place: Path) -> None:
+def remove_stale(place: Path) -> None:
     """Remove what launchers killed by force have left; their processes died with them."""
     for leftover in place.glob(f"{PREFIX}*"):
         with suppress(OSError):  # another launcher sweeps, too; or it is somebody else's

@@ -1,4 +1,4 @@
-"""A run's whole configuration: composed from the roles' own, as presets, and to JSON and back.
+"""A run's whole configuration: composed from the roles' own, and to JSON and back.
 
 The only place that knows every config at once; each role is given its own part.
 """

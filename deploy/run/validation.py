@@ -118,7 +118,8 @@ def validate_new_env(env: EnvConfig) -> None:
 
 
 def validate_launch(config: RunConfig, options: LaunchOptions) -> None:
-    """Raises ConfigError for options that the launcher has no use for, or lacks."""
+    """``validate``, and raises ConfigError for options that the launcher has no use for, or lacks."""
+    validate(config)
     launcher = options.launcher
     _validate_ray(options)
     if launcher == "lockstep" and options.redis_url is not None:

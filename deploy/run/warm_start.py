@@ -3,7 +3,6 @@
 The learner takes a checkpoint up as ever; so does the one that is started again after a crash. Optimisers begin anew.
 """
 
-import io
 import json
 from dataclasses import dataclass, fields
 from typing import Any
@@ -14,7 +13,7 @@ from torch import Tensor
 
 from rmc.common.agent import Agent, initial_agent
 from rmc.common.agent_config import POLICY_PARTS
-from rmc.common.checkpoint import PROGRESS, STATE
+from rmc.common.checkpoint import PROGRESS
 from rmc.common.errors import ConfigError, first_line
 from rmc.common.replay import ObservationStatistics
 from rmc.common.user_path import user_path
@@ -25,7 +24,7 @@ from rmc.deploy.run.env_sizes import FLAGS
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import InitParts
 from rmc.deploy.run.option_names import option
-from rmc.learner.learner_checkpoint import NOT_OURS, LearnerProgress, pack
+from rmc.learner.learner_checkpoint import NOT_OURS, LearnerProgress, pack, read_state
 from rmc.learner.update import JointUpdate
 from rmc.learner.update_order import make_update
 
@@ -63,7 +62,7 @@ def prepare(config: RunConfig, init_from: str, parts: InitParts) -> InitialCheck
     except ConfigError as error:
         raise ConfigError(OPTION, init_from, error.fix) from None
     try:
-        state = torch.load(io.BytesIO(files[STATE]), map_location="cpu", weights_only=True)
+        state = read_state(files, torch.device("cpu"))
         _check_sizes(init_from, parts, source, config, state["agent"])
         update = _begun(config, state, parts, bool(source.update.policy_ema_updates))
         progress = _progress(config.window_spec(), update.agent, json.loads(files[PROGRESS]), parts)

@@ -1,4 +1,4 @@
-"""What each command of the command line does."""
+"""What the commands that train, watch and end a run do."""
 
 import dataclasses
 import json

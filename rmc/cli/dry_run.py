@@ -21,14 +21,13 @@ from rmc.deploy.run.launch_options import LaunchOptions
 from rmc.deploy.run.opening import check_start
 from rmc.deploy.run.preflight import check_learner, check_port, ring_bytes_there
 from rmc.deploy.run.tracking import choose_tracking
-from rmc.deploy.run.validation import validate, validate_launch
+from rmc.deploy.run.validation import validate_launch
 
 FITS, NOT, SLOWER = "ok", "DOES NOT FIT", "slower"
 
 
 def dry_run(config: RunConfig, options: LaunchOptions, console: Console) -> int:
     """Try, measure, tell; 0 where it fits, else 1. Nothing is written in the run's folder. Raises ConfigError."""
-    validate(config)
     validate_launch(config, options)
     if options.launcher != "local":
         raise ConfigError("--dry-run", True, f"a trial needs --launcher local, not {options.launcher}")

@@ -32,7 +32,6 @@ def train(
 
     Ctrl-C ends the run, a closed terminal only where the cluster is this process's own.
     """
-    validate(config)
     validate_launch(config, options)
     enough = max(cores(), placement.reserved_cpus(config) + config.actors)  # of a cluster of our own
     with launcher.joined(options.ray_address, enough):

@@ -1,4 +1,4 @@
-"""The commands that look at a run or an environment, stop a run, or start a cluster, as dataclasses."""
+"""All commands but training, sweeps and the roles, as dataclasses."""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path

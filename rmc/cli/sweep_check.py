@@ -121,7 +121,6 @@ def as_planned(job: Job, config: RunConfig, options: LaunchOptions) -> Job:
 def _checked(job: Job, on_this_machine: bool) -> Checked:
     command = parser.parse(list(job.words))
     config, options = command.config(), dataclasses.replace(command.launch_options(), run_dir=job.folder)
-    validate(config)
     validate_launch(config, options)
     if on_this_machine:
         check_machine(config, options)

@@ -28,7 +28,7 @@ from rmc.deploy.run.memory_reach import reach_note
 from rmc.deploy.run.opening import open_run
 from rmc.deploy.run.preflight import check_machine
 from rmc.deploy.run.starts import resume_command
-from rmc.deploy.run.validation import validate, validate_launch
+from rmc.deploy.run.validation import validate_launch
 
 
 def train(
@@ -48,7 +48,6 @@ def train(
 
 def open_folder(config: RunConfig, options: LaunchOptions) -> RunFolder:
     """The run's folder, locked, once all is checked that needs no process. Raises ConfigError."""
-    validate(config)
     validate_launch(config, options)
     try:
         check_machine(config, options)

@@ -15,7 +15,7 @@ import pytest
 from rmc.common.errors import ConfigError, RoleDied
 from rmc.deploy.redis import socket_folder
 from rmc.deploy.redis.server import SOCKET_PATH_LIMIT, RedisServer
-from rmc.deploy.redis.socket_folder import LONGEST_NAME, SocketFolder, place_for_sockets, sweep
+from rmc.deploy.redis.socket_folder import LONGEST_NAME, SocketFolder, place_for_sockets, remove_stale
 from tests.raising import raising
 
 ODD = "a#b?c%d e\"f\\g'h+ü&@*[i]"
@@ -111,7 +111,7 @@ def test_what_another_pid_namespace_holds_is_left_until_it_ends(temporary: Path)
         pytest.skip("no namespaces here")
     process, folder = holder(*unshare)
     (folder / "redis.sock").touch()
-    sweep(temporary)
+    remove_stale(temporary)
     assert (folder / "redis.sock").exists()
     end(process)
     folder = folder.rename(folder.with_name(f"{socket_folder.PREFIX}{os.getpid()}-killed"))
@@ -120,7 +120,7 @@ def test_what_another_pid_namespace_holds_is_left_until_it_ends(temporary: Path)
 
 def deadline_sweep(place: Path, folder: Path) -> None:
     for _ in range(100):  # the kernel may let go of a killed process's lock a moment later
-        sweep(place)
+        remove_stale(place)
         if not folder.exists():
             return
         socket_folder.os.sched_yield()
@@ -140,7 +140,7 @@ def test_one_that_others_removed_is_made_again_and_locked(temporary: Path) -> No
     folder.renew()
     folder.path.rmdir()
     folder.renew()
-    sweep(temporary)
+    remove_stale(temporary)
     assert stat.S_IMODE(folder.path.stat().st_mode) == 0o700
     folder.path.rmdir()
     folder.path.touch()
