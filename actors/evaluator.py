@@ -270,5 +270,5 @@ def evaluation_record(rollout: Rollout) -> dict[str, Any]:
 
 def _record(rollout: Rollout, version: Version) -> dict[str, Any]:
     if not rollout.returns:
-        return {"eval_broken_episodes": rollout.broken}
+        return {"eval_broken_episodes": rollout.broken, "eval_update": version.update}
     return evaluation_record(rollout) | {"eval_steps": rollout.steps, "eval_update": version.update}

@@ -41,10 +41,11 @@ class BaselineRun(BaseCallback):
         self.config, self.folder, self._console, self._stop = config, folder, console, stop
         self._model = model
         self._full = False  # the disk, when it was saved last
-        self._began, self._wall_before = time.monotonic(), wall_seconds(folder.metrics)
-        self._save_at, self._record_at = time.monotonic() + SAVE_SECONDS, math.inf
+        self._record_at = math.inf
         self._next_evaluation = self._after(min(self.steps, evaluated_steps(folder)))  # one that was cut is made up
-        self._initial = self._first_evaluation()
+        self._initial = self._first_evaluation()  # no training time
+        self._began, self._wall_before = time.monotonic(), wall_seconds(folder.metrics)
+        self._save_at = self._began + SAVE_SECONDS
         self._metrics, self._record_at = MetricsLog(folder, flat(config)), 0.0
 
     @property

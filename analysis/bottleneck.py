@@ -125,6 +125,11 @@ def host_cores(vitals: Vitals) -> int:
 
 
 def free_cores(vitals: Vitals) -> float | None:
-    """Cores that nobody computes on, on average; a role that is busy need not compute: its environment may wait."""
-    idle = vitals.mean("launcher", "host_idle_share")
-    return idle * host_cores(vitals) if idle is not None else None
+    """Cores that nobody computes on, on average; a role that is busy need not compute: its environment may wait.
+
+    None where that was not recorded, or the run has a part of its machine: how idle that is, nobody measures.
+    """
+    idle, cores = vitals.mean("launcher", "host_idle_share"), host_cores(vitals)
+    if idle is None or cores < vitals.last("launcher", "host_cpus"):
+        return None
+    return idle * cores

@@ -55,7 +55,7 @@ def _comparable(agent: str, runs: list[History]) -> dict[str, list[History]]:
         state = "" if finished else ", unfinished"
         name = agent if len(alike) == 1 else f"{agent}{state}, {steps:,} steps"
         seeds: list[int] = []
-        for run in sorted(same, key=lambda run: run.seed):
+        for run in sorted(same, key=lambda run: (run.seed, runs.index(run))):  # as they were given
             seeds.append(run.seed)
             again = f", run {seeds.count(run.seed)} of its seed" if seeds.count(run.seed) > 1 else ""
             groups.setdefault(name + again, []).append(run)

@@ -16,7 +16,7 @@ from rmc.deploy.run.validation import validate
 
 LEAST_SECONDS = 5.0  # of training; fewer say nothing
 Diagnosis = Callable[[Vitals, RunConfig], Finding | None]
-ALWAYS: tuple[Diagnosis, ...] = (run_faults.not_saved, run_faults.stalled, run_faults.silent, run_faults.long_warm_up)
+ALWAYS: tuple[Diagnosis, ...] = (run_faults.not_saved, run_faults.stalled, run_faults.long_warm_up)
 IN_TRAINING: tuple[Diagnosis, ...] = (
     bottleneck,
     host_faults.threads_fight,
@@ -36,12 +36,14 @@ def examine(records: Sequence[Record], config: RunConfig) -> list[Finding]:
     """
     validate(config)
     vitals = Vitals(records)
+    whole = Vitals(records, math.inf)  # for what is rare, has lasted for long, or is compared with before training
     away = run_faults.redis_away(vitals, config)  # then nothing else can be judged
-    findings = [away] if away else [diagnosis(vitals, config) for diagnosis in ALWAYS]
+    findings: list[Finding | None] = [away]
+    if not away:
+        findings = [*(diagnosis(vitals, config) for diagnosis in ALWAYS), run_faults.silent(whole, config)]
     training = vitals.training()
     if training.seconds >= LEAST_SECONDS and not any(findings):
         findings += [diagnosis(training, config) for diagnosis in IN_TRAINING]
-        whole = Vitals(records, math.inf)  # for what is rare, or compared with the time before training
         findings += [run_faults.evaluator_starved(whole, config), host_faults.slow_memory(whole, config)]
     return [finding for finding in findings if finding is not None]
 

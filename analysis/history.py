@@ -181,7 +181,7 @@ def _warm_start(folder: RunFolder) -> list[str]:
     if not begun:
         return []
     run, number, parts = (begun[name] for name in ("run", "checkpoint", "parts"))
-    return [f"--init-from {Path(run).name}:{number}", *([f"--init-parts {parts}"] if parts != "all" else [])]
+    return [f"--init-from {run}:{number}", *([f"--init-parts {parts}"] if parts != "all" else [])]
 
 
 def _typed(path: str, value: Any) -> str:

@@ -21,6 +21,7 @@ from rmc.deploy.run.starts import format_start, starts
 LOOK_BYTES = 1 << 20  # of metrics at a look: a long run's past is read in several
 POINTS = 512  # most of a curve; even
 EVENTS, SAME_SECONDS = 200, 60.0  # most that are kept; within so long the same thing again is one event
+READING = "reading"  # the state while newer words are there, and not taken in yet
 KINDS = ("actor", "replay", "learner", "evaluator")
 DRAWN = re.compile(r"evaluation_return|episode_return|.*_per_s|.*_loss")  # of the main metrics
 SHOWN = (
@@ -123,6 +124,7 @@ class LiveRun:
         main = main_metrics(self._status)
         return {
             **{name: status[name] for name in SHOWN},
+            **({"state": READING} if self._status.is_past else {}),
             "fault": "",
             "time": time_and_eta(status["elapsed_s"], status["eta_s"], over),
             **{name: main.get(MAIN + name) for name in ("env_steps_per_s", "updates_per_s")},

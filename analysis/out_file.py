@@ -5,7 +5,7 @@ from pathlib import Path
 from rmc.common.errors import ConfigError
 from rmc.common.whole_file import temporary_path
 
-PICTURES = (".png", ".pdf", ".svg", ".jpg")
+PICTURES, NUMBERS = (".png", ".pdf", ".svg", ".jpg"), ".jsonl"
 
 
 def check_writable(name: str, path: Path, suffixes: tuple[str, ...]) -> None:

@@ -64,7 +64,7 @@ class ForkServer:
         self._generation = 0  # of the program
         self._status: int | None = None  # with which the last one ended; None where it hung
         self._ours: socket.socket | None = None
-        self._is_importing = False
+        self._is_importing, self._hung = False, False
 
     def fork(self, words: tuple[str, ...], environment: dict[str, str], log: int) -> ForkedProcess:
         """A process of ``rmc`` and these words, its output to ``log``.
@@ -82,6 +82,9 @@ class ForkServer:
                 return ForkedProcess(self, self._generation, pid)
         if self._status in (-signal.SIGKILL, -signal.SIGTERM):
             raise OSError(errno.EAGAIN, "the fork server of roles was killed")
+        if self._hung:
+            fix = "is the disk with Python's packages slow, or are the CPUs taken?"
+            raise RoleDied(f"the fork server of roles has not begun within {IMPORT_SECONDS:.0f} s, twice; {fix}")
         raise RoleDied(f"the fork server of roles does not start; its log is {self._log}")
 
     def status_of(self, pid: int, generation: int) -> int | None:
@@ -112,8 +115,8 @@ class ForkServer:
         try:
             socket.send_fds(self._ours, [msgpack.packb(request)], [] if descriptor is None else [descriptor])
             reply = self._reply(self._ours)
-        except OSError:  # or it hangs
-            reply = b""
+        except OSError as error:
+            reply, self._hung = b"", isinstance(error, TimeoutError)
         if not reply:
             self.close()
             return None

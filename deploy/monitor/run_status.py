@@ -87,7 +87,8 @@ class RunStatus:
         self._note_checkpoint(record)
         self.take_evaluation(record)
         self._note_movement(_number(self.get("learner", "time")))
-        if role.startswith("replay") and "env_steps" in record and _number(self.get("learner", "updates_per_s")) > 0:
+        trains = role.startswith("replay") and _number(self.get("learner", "updates_per_s")) > 0
+        if "env_steps" in record and (trains or (self.heard == "launcher" and role == "learner")):  # a baseline's
             self._pace.note(_number(record.get("time")), self.env_steps)
 
     def _note_word(self, record: dict[str, Any]) -> None:
@@ -202,7 +203,7 @@ class RunStatus:
     def eta_s(self) -> float | None:
         """Seconds to the end at the rate of the last minute of this start; None where that is not known yet."""
         rate = self._pace.steps_per_s
-        if rate is None or self.is_over:
+        if rate is None or self.is_over or "Redis" in self.silent():
             return None
         return max(0, self.total_steps - self.env_steps) / rate
 
@@ -215,8 +216,9 @@ class RunStatus:
         return self.aggregate("replay", name, over)
 
     def aggregate(self, kind: str, name: str, how: Callable[[list[float]], float]) -> float | None:
-        """The sum or mean over all roles whose name begins with ``kind``, or None."""
-        values = [record[name] for role, record in self.roles.items() if role.startswith(kind) and name in record]
+        """The sum or mean over all roles of this start whose name begins with ``kind``, or None."""
+        said = self.of_this_start().items()
+        values = [record[name] for role, record in said if role.startswith(kind) and name in record]
         return how(values) if values else None
 
     @property
@@ -228,8 +230,9 @@ class RunStatus:
 
     @property
     def broken_episodes(self) -> int:
-        """How many the environment's own faults have ended."""
-        return sum(record.get("broken_episodes", 0) for record in self.of_this_start().values())
+        """How many the environment's own faults have ended, of evaluations those of the newest."""
+        names, said = ("broken_episodes", "eval_broken_episodes"), self.of_this_start().values()
+        return sum(record.get(name, 0) for record in said for name in names)
 
 
 def _number(value: Any) -> float:

@@ -22,12 +22,12 @@ def terminal(width: int | None = None) -> Console:
 
 
 class View:
-    """A run's status shown on a console, live where that is a terminal; by a thread, whatever its owner waits for."""
+    """A run's status shown on a console, live where a terminal can; by a thread, whatever its owner waits for."""
 
     def __init__(self, status: RunStatus, console: Console) -> None:
         self._status, self._console, self._over = status, console, threading.Event()
         self._live: Live | None = None
-        if console.is_terminal:
+        if console.is_terminal and not console.is_dumb_terminal:  # on which nothing can be drawn anew
             self._live = Live(self._table(), console=console, auto_refresh=False)
             self._live.start()
         self._thread = threading.Thread(target=self._draw, name="view", daemon=True)

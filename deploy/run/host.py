@@ -14,6 +14,7 @@ import psutil
 from numpy.typing import NDArray
 
 CONTAINER_LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
+CONTAINER_USE = Path("/sys/fs/cgroup/memory.current"), Path("/sys/fs/cgroup/memory.stat")
 CPU_LIMITS = (  # of CPU time in a period of it
     (Path("/sys/fs/cgroup/cpu.max"),),
     (Path("/sys/fs/cgroup/cpu/cpu.cfs_quota_us"), Path("/sys/fs/cgroup/cpu/cpu.cfs_period_us")),
@@ -42,8 +43,16 @@ def this_machine(folder: Path) -> Machine:
 
 
 def free_memory() -> int:
-    """Bytes that are free, no more than a container may have."""
-    return min(memory_limit(), int(psutil.virtual_memory().available))
+    """Bytes that are free, no more than are left of a container's."""
+    return max(0, min(memory_limit() - _container_use(), int(psutil.virtual_memory().available)))
+
+
+def _container_use() -> int:
+    """Bytes that this container holds, but for what it has read of files; 0 where nothing counts them."""
+    with suppress(OSError, ValueError, KeyError):
+        used, counts = (path.read_text() for path in CONTAINER_USE)
+        return int(used) - int(dict(line.split() for line in counts.splitlines())["inactive_file"])
+    return 0
 
 
 def memory_limit() -> int:
@@ -102,14 +111,14 @@ def _disk(folder: Path) -> dict[str, float]:
 
 def _figures() -> dict[str, float]:
     """Load, memory and what is left of the CPUs."""
-    memory, cpu = psutil.virtual_memory(), psutil.cpu_times_percent()
+    cpu = psutil.cpu_times_percent()
     return {
         "host_cores": cores(),
         "host_cpus": os.cpu_count() or 1,
         "host_load": psutil.getloadavg()[0],
         "host_idle_share": cpu.idle / 100.0,
-        "host_memory_bytes": memory.total,
-        "host_available_bytes": memory.available,
+        "host_memory_bytes": memory_limit(),
+        "host_available_bytes": free_memory(),
         "host_swap_bytes": psutil.swap_memory().used,
         "host_steal_share": getattr(cpu, "steal", 0.0) / 100.0,
     }

@@ -4,12 +4,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rmc.analysis import curves, env_check, history
-from rmc.analysis.out_file import PICTURES, check_writable
+from rmc.analysis.out_file import NUMBERS, PICTURES, check_writable
 from rmc.analysis.report import check_report, write_report
 from rmc.analysis.report_run import ReportRun, told_apart
 from rmc.analysis.run_paths import each_readable
 from rmc.cli import run_options
 from rmc.common.errors import ConfigError
+from rmc.common.whole_file import write_whole
 from rmc.deploy.monitor.view import terminal
 
 
@@ -20,10 +21,14 @@ def check_env(command: run_options.CheckEnv) -> int:
 
 
 def plot(command: run_options.Plot) -> int:
-    check_writable("--out", command.out, PICTURES)
-    groups, console = curves.grouped(_histories(command.runs)), terminal(max(terminal().width, curves.WIDTH))
+    check_writable("--out", command.out, (*PICTURES, NUMBERS))
+    histories, console = _histories(command.runs), terminal(max(terminal().width, curves.WIDTH))
+    groups = curves.grouped(histories)
     console.print(*curves.tables(groups, command.reference), sep="\n")
-    curves.draw(groups, command.by, command.out)
+    if command.out.suffix.lower() == NUMBERS:
+        write_whole(command.out, "".join(f"{one.to_line()}\n" for one in histories).encode())
+    else:
+        curves.draw(groups, command.by, command.out)
     console.print(f"{command.out}", soft_wrap=True)
     return 0
 

@@ -114,7 +114,7 @@ class Plot:
     runs: Runs
     """Runs, folders with runs at any depth, quoted patterns like 'runs/*', or a study's files of JSON lines."""
     out: Path = Path("curves.png")
-    """The picture to write."""
+    """The picture to write; or, of a name like x.jsonl, every run's evaluations as a line of JSON."""
     by: Axis = "env_steps"
     """What returns are drawn over."""
     reference: str | None = None

@@ -45,7 +45,9 @@ def sweep(command: Sweep) -> int:
         raise ConfigError("--sweep-dir", str(folder), "is a run's folder; give another")
     if command.jobs < 0:
         raise ConfigError("--jobs", command.jobs, "take 1 or more, or 0 for as many as fit")
-    on_this_machine = command.launcher == "local"
+    on_this_machine = command.launcher != "ray"
+    if command.launcher == "lockstep":
+        spec = dataclasses.replace(spec, words=("--launcher=lockstep", *spec.words))
     if on_this_machine and command.ray_address != "auto":
         raise ConfigError("--ray-address", command.ray_address, "give --launcher ray, or leave it")
     sweep_check.check_values(spec, on_this_machine)
@@ -202,9 +204,9 @@ def _place(command: Sweep, todo: list[Job], checked: list[Checked]) -> Iterator[
     ring = max(ring_bytes(one.config) for one in checked)
     memory = max(room.run_memory(one.config, lockstep) for one in checked)
     gpus = int(any(one.options.device.startswith("cuda") for one in checked))
-    if command.launcher == "local":
+    if command.launcher != "ray":
         fit = 1 if gpus else room.runs_that_fit(cores, memory)
-        at_once = min(len(todo), command.jobs or fit)
+        at_once = min(len(todo), command.jobs or room.evenly(len(todo), fit))
         room.check_disk(todo[0].folder.parent, todo, ring, at_once, command.drop_replay)
         yield LocalRuns(at_once), f"{at_once} at a time, of {_count(cores_here(), 'core')}"
         return

@@ -35,8 +35,8 @@ class Sweep:
     """Runs at once; 0 for as many as cores and memory hold, or one where the device is cuda."""
     drop_replay: bool = False
     """Remove the replay ring of a run that is finished or pruned: evaluate, plot and export need none."""
-    launcher: Literal["local", "ray"] = "local"
-    """Whole runs on this machine, or spread over a Ray cluster, each on one node."""
+    launcher: Literal["local", "lockstep", "ray"] = "local"
+    """Runs on this machine, or each in lockstep there, or whole runs spread over a Ray cluster."""
     ray_address: str = "auto"
     """With --launcher ray: auto finds the cluster that this machine is in, local starts one on this machine."""
     train_words: tyro.conf.Suppress[tuple[str, ...]] = ()

@@ -5,6 +5,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+from rmc.common.bus.metrics_record import is_complete
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
@@ -31,7 +32,7 @@ def make_job(spec: Spec, folder: Path, values: dict[str, Any], seed: int) -> Job
 
 
 def is_finished(job: Job, config: RunConfig, options: LaunchOptions) -> bool:
-    """Whether its run has a result after as many steps. Raises ConfigError where the folder has another run."""
+    """Whether its run has a whole result after as many steps. Raises ConfigError where the folder has another run."""
     folder = RunFolder(job.folder)
     if not (folder.path / "config.json").exists():
         return False
@@ -44,8 +45,12 @@ def is_finished(job: Job, config: RunConfig, options: LaunchOptions) -> bool:
     if begun_with(folder).get("asked") != asked:
         fix = f"the run in {job.folder} began {format_begun(folder)}; use that, or another --sweep-dir"
         raise ConfigError("--init-from", options.init_from, fix)
-    result = folder.result()
-    return result is not None and result["env_steps"] >= config.total_steps
+    if (result := folder.result()) is None:
+        return False
+    if was["total_steps"] > config.total_steps:
+        fix = f"the run in {job.folder} has {was['total_steps']}; use that or more, or another --sweep-dir"
+        raise ConfigError("--total-steps", config.total_steps, fix)
+    return is_complete(result) and result["env_steps"] >= config.total_steps
 
 
 class Grid:

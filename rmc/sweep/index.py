@@ -5,6 +5,7 @@ import shlex
 from pathlib import Path
 
 from rmc.analysis.history import objects, of_run
+from rmc.common.bus.metrics_record import is_complete
 from rmc.common.errors import ConfigError
 from rmc.common.process.file_lock import release_lock, take_lock
 from rmc.common.whole_file import write_whole
@@ -55,11 +56,12 @@ class Index:
         self.write()
 
     def put(self, job: Job, state: State, seconds: float = 0.0, reason: str = "") -> None:
-        """Make its line anew. Seconds are added up over its starts."""
-        before = self.lines.get(job.name, {}).get("seconds", 0.0)
-        returned, env_steps = newest_return(job)
+        """Make its line anew. Seconds are added up over its starts; a start that nobody saw the end of has trained."""
+        seconds += self.lines.get(job.name, {}).get("seconds", 0.0)
+        returned, env_steps, trained_s = newest_return(job)
         words = f"rmc {shlex.join(job.command(job.folder))}"
-        cells = (job.name, state, words, job.seed, job.values, returned, env_steps, round(before + seconds, 1), reason)
+        seconds = round(max(seconds, trained_s), 1)
+        cells = (job.name, state, words, job.seed, job.values, returned, env_steps, seconds, reason)
         self.lines[job.name] = dict(zip(COLUMNS, cells, strict=True))
 
     def write(self) -> None:
@@ -67,15 +69,16 @@ class Index:
         write_whole(self._path, "".join(f"{json.dumps(line)}\n" for line in self.lines.values()).encode())
 
 
-def newest_return(job: Job) -> tuple[float | None, int]:
-    """Of its newest evaluation that was not cut, and the agent steps so far."""
+def newest_return(job: Job) -> tuple[float | None, int, float]:
+    """Of its newest evaluation that was not cut, and the agent steps and seconds of training so far."""
     folder = RunFolder(job.folder)
     if not (folder.path / "config.json").exists():
-        return None, 0
+        return None, 0, 0.0
     result = folder.result()
-    steps = result["env_steps"] if result is not None else 0
+    if result is not None and is_complete(result):  # no need to read the metrics of days
+        return result["eval_return_mean"], result["env_steps"], result["wall_s"]
     try:
         past = of_run(folder)
     except ConfigError:  # none yet
-        return None, steps
-    return past.evaluations[-1].return_mean, past.env_steps
+        return None, result["env_steps"] if result is not None else 0, 0.0
+    return past.evaluations[-1].return_mean, past.env_steps, past.wall_s

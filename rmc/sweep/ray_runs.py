@@ -72,7 +72,7 @@ class RayRun:
         self._actor = ray.remote(NodeRun).options(**needs).remote(job.words, job.folder, brought, os.getcwd())
         self._stamps: Stamps = brought.stamps  # of its files, those that are here
         self._pending: Any = self._actor.look.remote(self._stamps, True)
-        self._begun, self._look_at, self._copy_at = False, 0.0, 0.0
+        self._begun, self._killed, self._look_at, self._copy_at = False, False, 0.0, 0.0
 
     def status(self) -> int | None:
         """Its exit status, once that and all that it left are here."""
@@ -93,6 +93,9 @@ class RayRun:
             except OSError as error:
                 if error.errno not in NO_ROOM:
                     raise
+                if self._killed:
+                    self._lost = f"its last files found no room here ({error.strerror})"
+                    return self._end(LOST)
                 return None  # the next look takes the same answer, once there is room
             self._copy_at = now + parcel.bytes / BYTES_PER_SECOND
         self._pending, self._look_at = None, now + LOOK_SECONDS
@@ -119,6 +122,7 @@ class RayRun:
 
     def kill(self) -> None:
         """End it now, with what was copied last."""
+        self._killed = True
         with suppress(ray.exceptions.RayError):
             ray.kill(self._actor)
 

@@ -32,6 +32,12 @@ def runs_that_fit(run_cores: int, memory: int) -> int:
     return max(1, min(cores() // run_cores, free_memory() // memory))
 
 
+def evenly(runs: int, fit: int) -> int:
+    """How many at once of so many, where ``fit`` fit: the last ones are as many, and each has more of the cores."""
+    rounds = -(-runs // fit)
+    return -(-runs // rounds)
+
+
 def check_disk(folder: Path, jobs: Sequence[Job], ring: int, at_once: int, dropped: bool) -> None:
     """Raises ConfigError where the rings of runs that have none yet are larger than the free disk."""
     new = sum(not RunFolder(job.folder).rings() for job in jobs)

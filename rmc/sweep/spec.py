@@ -120,6 +120,8 @@ def _check_each_once(place: str, values: list[Any]) -> None:
 def check_name(place: str, name: str, value: Any, names: Set[str] = NAMES) -> None:
     """Raises ConfigError where that is no option that a sweep's runs may have."""
     told = value_without_passwords(value)
+    if name == "env":
+        raise ConfigError(place, told, "a sweep has one environment; start one for each")
     if name in OWN:
         raise ConfigError(place, told, "every run has its own; give env and seeds")
     if name not in names:

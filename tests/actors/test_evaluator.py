@@ -216,6 +216,21 @@ def test_the_evaluator_counts_them_and_makes_new_environments() -> None:
     evaluator.close()
 
 
+def test_an_evaluation_of_which_nothing_is_left_says_of_what_it_was() -> None:
+    bus = MemoryBus()
+    evaluator = Evaluator(
+        1, lambda: Dead(counting()), AGENT, EvaluatorConfig(episodes=2), bus, clock=itertools.count().__next__
+    )
+    publish(bus, 7, evaluate=True)
+    step_until_idle(evaluator)
+    record = evaluator.metrics()
+    assert {name: record[name] for name in ("eval_broken_episodes", "eval_update")} == {
+        "eval_broken_episodes": 2, "eval_update": 7,
+    }  # fmt: skip
+    assert "eval_return_mean" not in record
+    evaluator.close()
+
+
 class Scripted:
     """Acts by its own count, and notes what it is given."""
 

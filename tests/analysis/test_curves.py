@@ -145,7 +145,7 @@ def test_a_warm_start_is_another_agent(tmp_path: Path) -> None:
     began = {"asked": ["a:7", "policy"], "run": "/runs/a", "checkpoint": 7, "parts": "policy"}
     start = {"time": 1.0, "version": "0.1.0", "env_steps": 0, "init_from": began}
     (tmp_path / "history.jsonl").write_text(json.dumps(start) + "\n")
-    assert history.describe(tmp_path).agent == "RMC --init-from a:7 --init-parts policy"
+    assert history.describe(tmp_path).agent == "RMC --init-from /runs/a:7 --init-parts policy"
     runs = [history_of("RMC", last=100.0, initial=0.0), history_of("warm", last=300.0, initial=290.0)]
     warm = next(line for line in shown(curves.tables(curves.grouped(runs), "RMC")).splitlines() if "warm" in line)
     assert warm.split()[-2:] == ["3.00", "1.00"]
@@ -265,6 +265,22 @@ def test_a_run_counts_once_and_what_differs_is_told_apart(tmp_path):
     for cells in ("4  100 (100, 100, 100, 100)", "1                 300 (300)", "9,001 to 9,002", "1, 1 unfinished"):
         assert cells in text
     assert curves._named("RMC, 3,000 steps", groups, "env_steps") == "RMC, 3,000 steps (4 seeds, each a line)"
+
+
+def test_a_seeds_runs_are_told_apart_in_the_order_given():
+    """However far each went beyond its end: they may be one value of ``actors`` after the other."""
+    first = [dataclasses.replace(history_of(seed=seed, last=100.0), env_steps=3000 + seed) for seed in (1, 2)]
+    second = [dataclasses.replace(history_of(seed=seed, last=200.0), env_steps=3003 - seed) for seed in (1, 2)]
+    groups = curves.grouped([*first, *second])["HalfCheetah-v5"]
+    assert groups == {"RMC": first, "RMC, run 2 of its seed": second}
+
+
+def test_the_numbers_that_are_drawn_can_be_had(tmp_path, capsys):
+    lines, out = tmp_path / "lines", tmp_path / "numbers.jsonl"
+    lines.write_text("".join(f"{history_of(seed=seed).to_line()}\n" for seed in (1, 2)))
+    assert run(["plot", str(lines), "--out", str(out)]) == 0
+    assert str(out) in capsys.readouterr().out
+    assert out.read_text() == lines.read_text()
 
 
 def test_runs_a_little_longer_are_as_long():

@@ -72,9 +72,11 @@ def test_the_actors_hold_the_learner_back() -> None:
     full = bottleneck(vitals(**slow, launcher=HOST | {"host_idle_share": 0.02}), CONFIG)
     assert full is not None
     assert full.advice.startswith("all cores are taken: more machines (--launcher ray)")
-    unknown = bottleneck(vitals(**slow), CONFIG)
-    assert unknown is not None
-    assert unknown.advice.startswith("more --actors would help where cores are free")
+    part = HOST | {"host_cpus": 64, "host_idle_share": 0.95}  # what is idle is not the run's
+    for host in ({}, part):
+        unknown = bottleneck(vitals(**slow, launcher=host), CONFIG)
+        assert unknown is not None
+        assert unknown.advice.startswith("more --actors would help where cores are free")
 
 
 def test_the_replay_server_holds_both_back() -> None:
@@ -185,6 +187,12 @@ def test_a_role_that_fell_silent_is_named() -> None:
         str(finding) == "silent: actor-0 for 50 s said nothing; it hangs, or its machine is away; see logs/actor-0.log"
     )
     assert run_faults.silent(vitals(), CONFIG) is None
+
+
+@pytest.mark.parametrize("role", ["actor-0", "learner"])
+def test_it_is_named_however_long_it_is_silent(role: str) -> None:
+    since = [one for one in records(900) if one["role"] != role or one["time"] < 1010.0]
+    assert f"silent: {role} for 890 s said nothing" in "\n".join(map(str, examine(since, CONFIG)))
 
 
 def test_a_warm_up_that_takes_long_is_told() -> None:

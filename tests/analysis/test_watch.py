@@ -377,10 +377,12 @@ def test_the_past_is_drawn_where_it_was_and_nobody_is_silent_meanwhile(
         say(folder, "learner", time=when, updates_per_s=10.0, env_steps=50 * second)
     monkeypatch.setattr(live_run, "LOOK_BYTES", 1 << 14)
     monkeypatch.setattr("rmc.deploy.monitor.run_status.SILENT_SECONDS", 600.0)
-    watched, notices, looks = LiveRun("run", folder.path), [], 0
+    watched, notices, states, looks = LiveRun("run", folder.path), [], [], 0
     while news := watched.look():
         notices.append(news.get("notices", {}))
+        states += [news["state"]] if "state" in news else []
         looks += 1
+    assert states == ["reading", "training"]
     assert looks > 5
     assert not any("silent" in one for one in notices)
     points = watched.everything()["curves"]["updates_per_s"][1]

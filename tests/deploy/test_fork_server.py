@@ -97,6 +97,17 @@ def test_one_that_does_not_start_says_where_to_look(tmp_path: Path, monkeypatch:
     assert (tmp_path / "fork_server.log").read_text() == "no torch here\n" * 2
 
 
+def test_one_that_does_not_begin_in_time_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    slow = tmp_path / "python"
+    slow.write_text("#!/bin/sh\nexec sleep 60\n")
+    slow.chmod(0o700)
+    monkeypatch.setattr(fork_server.sys, "executable", str(slow))
+    monkeypatch.setattr("rmc.deploy.local.fork_server.IMPORT_SECONDS", 0.2)
+    monkeypatch.setattr("rmc.deploy.local.fork_server.END_SECONDS", 0.2)
+    with pytest.raises(RoleDied, match=r"has not begun within 0 s, twice; is the disk .* slow, or are the CPUs taken"):
+        fork(ForkServer(tmp_path / "fork_server.log"), tmp_path / "log", "actor")
+
+
 def test_one_that_is_killed_as_it_starts_is_tried_again_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As a machine short of memory does it; a role that cannot be started now is started later."""
     killed = tmp_path / "python"

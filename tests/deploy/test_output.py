@@ -9,6 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from rmc.deploy.monitor.output import Output
 from rmc.deploy.monitor.run_status import RunStatus
@@ -50,6 +51,15 @@ def test_a_live_view_outlives_its_terminal(log: Path, monkeypatch: pytest.Monkey
         console.print("kept")
     assert log.read_text().endswith("kept\n")
     assert log.read_text().count("env steps") == 1
+
+
+def test_a_terminal_that_cannot_draw_gets_lines(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERM", "dumb")
+    console = Console(file=io.StringIO(), force_terminal=True)
+    view = View(RunStatus("Env-v0", "debug", 0, 10, 1.0), console)
+    view._show()
+    view.close()
+    assert console.file.getvalue().startswith("0% | 0 of 10 steps")  # type: ignore[attr-defined]
 
 
 def test_a_full_disk_is_over_some_day(log: Path) -> None:

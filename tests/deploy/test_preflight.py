@@ -106,6 +106,16 @@ def test_a_containers_memory_is_what_counts(tmp_path: Path, monkeypatch: pytest.
     with pytest.raises(ConfigError, match=r"^--capacity=100000: takes .* of 1.0 MB memory; take at most \d+$"):
         check_ring_fits(large, LaunchOptions(tmp_path))
     assert this_machine(tmp_path).free_memory_bytes == 1_000_000
+    use = tmp_path / "memory.current", tmp_path / "memory.stat"
+    monkeypatch.setattr(host, "CONTAINER_USE", use)
+    use[0].write_text("700000\n")
+    use[1].write_text("anon 500000\ninactive_file 200000\n")
+    assert this_machine(tmp_path).free_memory_bytes == 500_000
+    figures = host.HostFigures(tmp_path).take()
+    assert (figures["host_available_bytes"], figures["host_memory_bytes"]) == (500_000, 1_000_000)
+    use[0].write_text("9000000\n")
+    assert this_machine(tmp_path).free_memory_bytes == 0
+    use[0].unlink()
     assert runs_that_fit(1, 1_000_000) == 1
 
 

@@ -129,6 +129,35 @@ def test_no_end_is_told_before_the_learner_learns_or_while_no_steps_come() -> No
     assert of.eta_s is None
 
 
+def test_no_end_is_told_while_redis_is_away() -> None:
+    of = full_status()
+    of.take({"role": "launcher", "time": time.time(), "redis_away_s": 600.0})
+    assert of.eta_s is None
+
+
+def test_what_roles_of_an_earlier_start_said_is_no_rate_of_this_one() -> None:
+    of, now = RunStatus("Env-v0", "debug", 0, 1_000, 1.0), time.time()
+    of.take({"role": "replay", "time": now - 500.0, "env_steps": 70, "env_steps_per_s": 100.0})
+    of.take({"role": "launcher", "time": now, "start_s": 0.0})
+    assert of.replay("env_steps_per_s", sum) is None
+
+
+def test_a_baselines_end_is_told_from_its_learner() -> None:
+    of, now = RunStatus("Env-v0", "sac", 0, 10_000, 1.0), time.time()
+    of.heard = "launcher"
+    for second in range(20):
+        of.take({"role": "launcher", "time": now + second, "wall_s": float(second)})
+        of.take({"role": "learner", "time": now + second, "env_steps": 40 * second, "updates": 40 * second})
+    assert of.eta_s == pytest.approx((10_000 - 760) / 40.0)
+
+
+def test_episodes_that_break_in_an_evaluation_are_told_too() -> None:
+    of = full_status()
+    before = of.broken_episodes
+    of.take({"role": "evaluator", "time": time.time(), "eval_broken_episodes": 3, "eval_update": 9})
+    assert of.broken_episodes == before + 3
+
+
 def waiting_status(seconds: int, **learner: Any) -> RunStatus:
     """All wait, and no counter has moved for so long."""
     of, now = RunStatus("Env-v0", "debug", 0, 100_000, 1.0), time.time()

@@ -196,12 +196,18 @@ def test_a_full_disk_here_is_waited_out(tmp_path: Path, monkeypatch: pytest.Monk
     run._runs, run._actor = types.SimpleNamespace(release=lambda: ended.append(1)), None  # type: ignore[assignment]
     run._job = Job(tmp_path / "runs" / "one", (), 0, {})
     run._lost, run._lock = "", RunFolder(run._job.folder).lock
-    run._log, run._stamps, run._pending, run._look_at = b"", {}, answer, 0.0
+    run._log, run._stamps, run._pending, run._look_at, run._killed = b"", {}, answer, 0.0, False
     assert run.status() is None
     assert run._pending is answer
     assert run.status() == 0
     assert (run._job.folder / "result.json").exists()
     assert ended == [1]
+
+    tries[:], run._pending = [errno.ENOSPC] * 2, answer
+    assert run.status() is None
+    run.kill()
+    assert run.status() == ray_runs.LOST
+    assert run.last_words() == "its last files found no room here (No space left on device)"
 
 
 def test_a_copy_that_goes_back_is_not_sent_again(tmp_path: Path) -> None:

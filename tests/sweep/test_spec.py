@@ -107,6 +107,7 @@ FILES = {
     "options = 1": "options=1: write it as a table",
     "[options]\ntotal_step = 5": "options.total_step=5: no option that a sweep's runs take; did you mean total_steps?",
     "[options]\nseed = 5": "options.seed=5: every run has its own",
+    '[grid]\nenv = ["Hopper-v5", "Ant-v5"]': "grid.env=['Hopper-v5', 'Ant-v5']: a sweep has one environment; start one",
     '[options]\nrun_dir = "x"': "options.run_dir='x': no option that a sweep's runs take",
     '[options]\nredis_url = "redis://:pw@x"': "options.redis_url='redis://x': no option that a sweep's runs take",
     '[grid]\nactors = ["redis://:pw@x"]': "grid.actors='redis://x': Error parsing --actors: 'redis://x' is no whole",

@@ -15,7 +15,7 @@ import psutil
 import pytest
 from rich.console import Console
 
-from rmc.cli import parser
+from rmc.cli import parser, sweep_command
 from rmc.cli.main import run
 from rmc.cli.sweep_check import Checked, as_planned, check_jobs, check_values, read_job
 from rmc.cli.sweep_command import _count, grid_work, read_sweep
@@ -242,6 +242,31 @@ def test_what_is_stopped_as_hopeless_is_over_however_early_that_was(tmp_path: Pa
     assert "pruned" in pool.OVER
 
 
+def test_a_run_that_was_trained_for_longer_is_no_result_of_fewer_steps(tmp_path: Path) -> None:
+    job = made(tmp_path / "sweep" / "seed=0")
+    config, options = read_job(job)
+    fewer = dataclasses.replace(config, total_steps=config.total_steps - 1)
+    with pytest.raises(ConfigError, match=r"^--total-steps=3999: the run in .*seed=0 has 4000; use that or more, or"):
+        is_finished(job, fewer, options)
+
+
+def test_a_run_whose_last_evaluation_was_cut_is_not_over(tmp_path: Path) -> None:
+    job = made(tmp_path / "sweep" / "seed=0")
+    folder = RunFolder(job.folder)
+    folder.write_result({**(folder.result() or {}), "eval_cut": 1})
+    assert not is_finished(job, *read_job(job))
+
+
+def test_a_start_that_nobody_saw_the_end_of_has_its_seconds(tmp_path: Path) -> None:
+    """As that of a sweep that was killed."""
+    job = made(tmp_path / "sweep" / "seed=0")
+    with closing(Index(job.folder.parent)) as index:
+        index.put(job, "finished", 0.5)
+        assert index.lines[job.name]["seconds"] == 1.0
+        index.put(job, "finished", 7.0)
+        assert index.lines[job.name]["seconds"] == 8.0
+
+
 def test_runs_that_began_with_nothing_are_no_results_of_a_warm_start(tmp_path: Path, capsys) -> None:
     job = made(tmp_path / "sweep" / "seed=0")
     config, options = read_job(job)
@@ -275,6 +300,14 @@ def test_a_run_that_goes_on_takes_what_the_sweep_planned_and_not_what_it_had(tmp
     assert "--total-steps" not in as_planned(said, config, options).words
 
 
+def test_lockstep_is_the_launcher_of_every_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    planned: list[Any] = []
+    monkeypatch.setattr(sweep_command, "_conduct", lambda command, work, checked, index: planned.extend(checked) or 0)
+    words = ["InvertedPendulum-v5", "--preset", "debug", "--seeds", "1-2", "--sweep-dir", str(tmp_path / "sweep")]
+    assert run(["sweep", *words, "--launcher", "lockstep"]) == 0
+    assert [one.options.launcher for one in planned] == ["lockstep", "lockstep"]
+
+
 def test_a_grid_of_launchers_is_one_of_runs(tmp_path: Path) -> None:
     spec = read_sweep(
         parser.parse(["sweep", "InvertedPendulum-v5", "--preset", "debug", "--grid", "launcher=local,lockstep"])
@@ -305,7 +338,7 @@ def test_a_runs_seconds_are_of_all_its_starts(tmp_path: Path) -> None:
             index.begin(job)
             index.end(job, pool.Ending(cast(Any, state), seconds))
             total = index.lines[job.name]["seconds"]
-    assert total == 3.5
+    assert total == 1.0 + 1.5 + 2.0  # it was trained for a second before
 
 
 def test_an_index_whose_values_are_none_is_refused(tmp_path: Path) -> None:
@@ -383,6 +416,7 @@ def test_cores_are_shared_out() -> None:
         assert len(parts) == count
         assert set().union(*parts) == mine
         assert count > len(mine) or sum(map(len, parts)) == len(mine)
+    assert [room.evenly(runs, 16) for runs in (1, 16, 17, 20, 33)] == [1, 16, 9, 10, 11]
     assert room.runs_that_fit(1, 1 << 60) == 1
     assert room.runs_that_fit(1, 1) == len(mine)
     assert room.runs_that_fit(2 * len(mine), 1) == 1
