@@ -26,7 +26,8 @@ def threads_fight(vitals: Vitals, config: RunConfig) -> Finding | None:
     if threads > cores:
         measured = f"the learner has {threads} threads {on_cores}"
         return Finding("threads fight", measured, f"--threads {max(1, cores - 1)} leaves one to the other roles")
-    if busy <= CROWDED * cores or (free_cores(vitals) or 0.0) > IDLE_CORES * cores:
+    free = free_cores(vitals)
+    if busy <= CROWDED * cores or free is None or free > IDLE_CORES * cores:
         return None
     measured = f"{busy:.1f} threads of the run are busy at a time, {on_cores}"
     fewer = max(1, int(cores - busy + threads))

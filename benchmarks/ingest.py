@@ -22,9 +22,9 @@ from benchmarks.harness import (
     random_rows,
     replay_process,
     running,
-    speed,
     started_peer,
 )
+from benchmarks.peers.turns import speed
 from benchmarks.replay import WINDOWS, measure_each, spec_of
 from benchmarks.sender import CHUNK, Sender
 from rmc.common.window import WindowSpec

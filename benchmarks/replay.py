@@ -28,10 +28,9 @@ from benchmarks.harness import (
     replay_process,
     running,
     save,
-    speed,
     started_peer,
 )
-from benchmarks.peers.turns import send_at
+from benchmarks.peers.turns import send_at, speed
 from benchmarks.sender import CHUNK, Sender
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.env.config import EnvConfig

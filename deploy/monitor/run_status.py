@@ -182,7 +182,8 @@ class RunStatus:
         """Agent steps committed to the ring."""
         if self.final_steps is not None:
             return self.final_steps
-        steps = self.replay("env_steps", sum) or self.get("learner", "env_steps")
+        said = [of for role, of in self.roles.items() if role.startswith("replay") and "env_steps" in of]
+        steps = sum(one["env_steps"] for one in said) or self.get("learner", "env_steps")  # also of earlier starts
         return max(_steps(steps) or 0, self.steps_before)  # one of several replay servers may speak first
 
     @property

@@ -14,7 +14,14 @@ import psutil
 from numpy.typing import NDArray
 
 CONTAINER_LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
-CONTAINER_USE = Path("/sys/fs/cgroup/memory.current"), Path("/sys/fs/cgroup/memory.stat")
+CONTAINER_USE = (  # what it holds, what that is, and which of it is of files alone
+    (Path("/sys/fs/cgroup/memory.current"), Path("/sys/fs/cgroup/memory.stat"), "inactive_file"),
+    (
+        Path("/sys/fs/cgroup/memory/memory.usage_in_bytes"),
+        Path("/sys/fs/cgroup/memory/memory.stat"),
+        "total_inactive_file",
+    ),
+)
 CPU_LIMITS = (  # of CPU time in a period of it
     (Path("/sys/fs/cgroup/cpu.max"),),
     (Path("/sys/fs/cgroup/cpu/cpu.cfs_quota_us"), Path("/sys/fs/cgroup/cpu/cpu.cfs_period_us")),
@@ -44,14 +51,16 @@ def this_machine(folder: Path) -> Machine:
 
 def free_memory() -> int:
     """Bytes that are free, no more than are left of a container's."""
-    return max(0, min(memory_limit() - _container_use(), int(psutil.virtual_memory().available)))
+    memory, limit = psutil.virtual_memory(), memory_limit()
+    left = limit - _container_use() if limit < memory.total else limit
+    return max(0, min(left, int(memory.available)))
 
 
 def _container_use() -> int:
     """Bytes that this container holds, but for what it has read of files; 0 where nothing counts them."""
-    with suppress(OSError, ValueError, KeyError):
-        used, counts = (path.read_text() for path in CONTAINER_USE)
-        return int(used) - int(dict(line.split() for line in counts.splitlines())["inactive_file"])
+    for use, counts, files in CONTAINER_USE:
+        with suppress(OSError, ValueError, KeyError):
+            return int(use.read_text()) - int(dict(line.split() for line in counts.read_text().splitlines())[files])
     return 0
 
 

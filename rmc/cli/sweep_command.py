@@ -47,7 +47,7 @@ def sweep(command: Sweep) -> int:
         raise ConfigError("--jobs", command.jobs, "take 1 or more, or 0 for as many as fit")
     on_this_machine = command.launcher != "ray"
     if command.launcher == "lockstep":
-        spec = dataclasses.replace(spec, words=("--launcher=lockstep", *spec.words))
+        spec = dataclasses.replace(spec, words=(*spec.words, "--launcher=lockstep"))
     if on_this_machine and command.ray_address != "auto":
         raise ConfigError("--ray-address", command.ray_address, "give --launcher ray, or leave it")
     sweep_check.check_values(spec, on_this_machine)
@@ -206,7 +206,8 @@ def _place(command: Sweep, todo: list[Job], checked: list[Checked]) -> Iterator[
     gpus = int(any(one.options.device.startswith("cuda") for one in checked))
     if command.launcher != "ray":
         fit = 1 if gpus else room.runs_that_fit(cores, memory)
-        at_once = min(len(todo), command.jobs or room.evenly(len(todo), fit))
+        fit = fit if lockstep else room.evenly(len(todo), fit)  # one thread of it uses no second core
+        at_once = min(len(todo), command.jobs or fit)
         room.check_disk(todo[0].folder.parent, todo, ring, at_once, command.drop_replay)
         yield LocalRuns(at_once), f"{at_once} at a time, of {_count(cores_here(), 'core')}"
         return

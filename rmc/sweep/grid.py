@@ -10,7 +10,7 @@ from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.launch_options import LaunchOptions
-from rmc.deploy.run.opening import SAME_AGENT
+from rmc.deploy.run.opening import LAST_EVALUATION, SAME_AGENT
 from rmc.deploy.run.option_names import flat, option, option_words
 from rmc.deploy.run.starts import begun_with, format_begun
 from rmc.sweep.job import Job, run_name
@@ -32,13 +32,17 @@ def make_job(spec: Spec, folder: Path, values: dict[str, Any], seed: int) -> Job
 
 
 def is_finished(job: Job, config: RunConfig, options: LaunchOptions) -> bool:
-    """Whether its run has a whole result after as many steps. Raises ConfigError where the folder has another run."""
+    """Whether its run has a result after as many steps. Raises ConfigError where the folder has another run.
+
+    A last evaluation that was cut is played again where an option of it has changed: else it would be cut again.
+    """
     folder = RunFolder(job.folder)
     if not (folder.path / "config.json").exists():
         return False
     was, now = flat(folder.config()), flat(config)
+    changed = {path for path in now if was.get(path) != now[path]}
     for path in now:
-        if path not in SAME_AGENT and was.get(path) != now[path]:
+        if path in changed - SAME_AGENT:
             fix = f"the run in {job.folder} has {was.get(path)!r}; use that, or another --sweep-dir"
             raise ConfigError("seeds" if path == "seed" else option(path), now[path], fix)
     asked = None if options.init_from is None else [options.init_from, options.init_parts]
@@ -50,7 +54,8 @@ def is_finished(job: Job, config: RunConfig, options: LaunchOptions) -> bool:
     if was["total_steps"] > config.total_steps:
         fix = f"the run in {job.folder} has {was['total_steps']}; use that or more, or another --sweep-dir"
         raise ConfigError("--total-steps", config.total_steps, fix)
-    return is_complete(result) and result["env_steps"] >= config.total_steps
+    played_again = not is_complete(result) and changed and changed <= LAST_EVALUATION
+    return result["env_steps"] >= config.total_steps and not played_again
 
 
 class Grid:

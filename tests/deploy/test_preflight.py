@@ -93,7 +93,9 @@ def test_a_run_that_goes_on_is_offered_no_capacity_that_it_would_refuse(memory: 
 
 def test_a_containers_memory_is_what_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     limit = tmp_path / "memory.max"
+    use = tmp_path / "memory.current", tmp_path / "memory.stat"
     monkeypatch.setattr(host, "CONTAINER_LIMITS", (limit, tmp_path / "none"))
+    monkeypatch.setattr(host, "CONTAINER_USE", [(tmp_path / "none", use[1], ""), (*use, "inactive_file")])
     for text in (None, "max\n", str(1 << 62)):
         if text is not None:
             limit.write_text(text)
@@ -106,8 +108,6 @@ def test_a_containers_memory_is_what_counts(tmp_path: Path, monkeypatch: pytest.
     with pytest.raises(ConfigError, match=r"^--capacity=100000: takes .* of 1.0 MB memory; take at most \d+$"):
         check_ring_fits(large, LaunchOptions(tmp_path))
     assert this_machine(tmp_path).free_memory_bytes == 1_000_000
-    use = tmp_path / "memory.current", tmp_path / "memory.stat"
-    monkeypatch.setattr(host, "CONTAINER_USE", use)
     use[0].write_text("700000\n")
     use[1].write_text("anon 500000\ninactive_file 200000\n")
     assert this_machine(tmp_path).free_memory_bytes == 500_000

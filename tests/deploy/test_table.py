@@ -137,9 +137,12 @@ def test_no_end_is_told_while_redis_is_away() -> None:
 
 def test_what_roles_of_an_earlier_start_said_is_no_rate_of_this_one() -> None:
     of, now = RunStatus("Env-v0", "debug", 0, 1_000, 1.0), time.time()
-    of.take({"role": "replay", "time": now - 500.0, "env_steps": 70, "env_steps_per_s": 100.0})
+    for shard in ("replay-0", "replay-1"):
+        of.take({"role": shard, "time": now - 500.0, "env_steps": 70, "env_steps_per_s": 100.0})
     of.take({"role": "launcher", "time": now, "start_s": 0.0})
     assert of.replay("env_steps_per_s", sum) is None
+    of.take({"role": "replay-0", "time": now, "env_steps": 71, "env_steps_per_s": 9.0})
+    assert (of.replay("env_steps_per_s", sum), of.env_steps) == (9.0, 141)  # what is counted goes on
 
 
 def test_a_baselines_end_is_told_from_its_learner() -> None:

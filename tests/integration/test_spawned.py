@@ -13,7 +13,7 @@ import pytest
 
 from rmc.common.errors import STOPPED_STATUS
 from rmc.common.process.watchdog import HUNG_STATUS
-from rmc.deploy.redis.socket_folder import sweep
+from rmc.deploy.redis.socket_folder import remove_stale
 from tests.command import COMMAND
 from tests.integration.running import Training
 from tests.integration.spawning_env import SPAWNED
@@ -88,7 +88,7 @@ def until_ended(run: Spawner) -> None:
     run.process.kill()
     run.process.wait()
     end_all(run)
-    sweep(Path(tempfile.gettempdir()))
+    remove_stale(Path(tempfile.gettempdir()))
 
 
 def end_all(run: Spawner) -> None:

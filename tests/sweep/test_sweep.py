@@ -250,11 +250,23 @@ def test_a_run_that_was_trained_for_longer_is_no_result_of_fewer_steps(tmp_path:
         is_finished(job, fewer, options)
 
 
-def test_a_run_whose_last_evaluation_was_cut_is_not_over(tmp_path: Path) -> None:
+def test_a_last_evaluation_that_was_cut_is_played_again_with_more_time(tmp_path: Path) -> None:
+    """With the same time it would be cut again; where other options differ the run could not go on."""
     job = made(tmp_path / "sweep" / "seed=0")
     folder = RunFolder(job.folder)
     folder.write_result({**(folder.result() or {}), "eval_cut": 1})
-    assert not is_finished(job, *read_job(job))
+    config, options = read_job(job)
+    assert is_finished(job, config, options)
+    longer = dataclasses.replace(config, evaluator=dataclasses.replace(config.evaluator, evaluation_seconds=900.0))
+    assert not is_finished(job, longer, options)
+    assert is_finished(job, dataclasses.replace(longer, actors=2), options)
+    with closing(Index(job.folder.parent)) as index:
+        index.put(job, "finished")
+        assert run_line(job, index) == (
+            "gamma 0.99, seed 0: 1 s; its last evaluation was cut, or an episode broke; "
+            "a larger --evaluation-seconds plays it again"
+        )
+        assert index.lines[job.name]["return"] is None
 
 
 def test_a_start_that_nobody_saw_the_end_of_has_its_seconds(tmp_path: Path) -> None:
