@@ -139,7 +139,7 @@ def draw() -> None:
         marks = [(row.steps, row.public) for row in rows("returns") if row.env == env and row.public is not None]
         if marks:
             (handles["public SAC, on -v4"],) = axes.plot(*zip(*marks, strict=True), "x", color="black", markersize=8)
-        axes.set(title=env)
+        axes.set(title=env.replace(", ", "\n"))
         axes.locator_params(axis="x", nbins=4)
         axes.grid(alpha=0.3)
     figure.supxlabel("environment steps")
