@@ -16,7 +16,7 @@ from rmc.sweep.pool import Ending, State
 NAME = "sweep.jsonl"
 COLUMNS = ("run", "state", "words", "seed", "values", "return", "env_steps", "seconds", "reason")
 BY_HAND = "fix or remove its line"
-CUT = "its last evaluation was cut, or an episode broke; a larger --evaluation-seconds plays it again"
+CUT = "that is an earlier evaluation, as the last one was cut or broke; a larger --evaluation-seconds plays it again"
 
 
 class Index:
@@ -62,7 +62,8 @@ class Index:
         returned, env_steps, trained_s = newest_return(job)
         words = f"rmc {shlex.join(job.command(job.folder))}"
         seconds = round(max(seconds, trained_s), 1)
-        reason = CUT if state == "finished" and returned is None else reason
+        if state == "finished" and not is_complete(RunFolder(job.folder).result() or {}):
+            reason = CUT
         cells = (job.name, state, words, job.seed, job.values, returned, env_steps, seconds, reason)
         self.lines[job.name] = dict(zip(COLUMNS, cells, strict=True))
 
@@ -72,19 +73,15 @@ class Index:
 
 
 def newest_return(job: Job) -> tuple[float | None, int, float]:
-    """Of its newest evaluation that was not cut, and the agent steps and seconds of training so far.
-
-    None where the last one of a finished run was cut: no earlier one stands for the end.
-    """
+    """Of its newest evaluation that was not cut, and the agent steps and seconds of training so far."""
     folder = RunFolder(job.folder)
     if not (folder.path / "config.json").exists():
         return None, 0, 0.0
     result = folder.result()
-    if result is not None:  # no need to read the metrics of days
-        returned = result["eval_return_mean"] if is_complete(result) else None
-        return returned, result["env_steps"], result["wall_s"]
+    if result is not None and is_complete(result):  # no need to read the metrics of days
+        return result["eval_return_mean"], result["env_steps"], result["wall_s"]
     try:
         past = of_run(folder)
     except ConfigError:  # none yet
-        return None, 0, 0.0
+        return None, result["env_steps"] if result is not None else 0, 0.0
     return past.evaluations[-1].return_mean, past.env_steps, past.wall_s

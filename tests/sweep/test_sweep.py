@@ -263,10 +263,9 @@ def test_a_last_evaluation_that_was_cut_is_played_again_with_more_time(tmp_path:
     with closing(Index(job.folder.parent)) as index:
         index.put(job, "finished")
         assert run_line(job, index) == (
-            "gamma 0.99, seed 0: 1 s; its last evaluation was cut, or an episode broke; "
+            "gamma 0.99, seed 0: 0 s; that is an earlier evaluation, as the last one was cut or broke; "
             "a larger --evaluation-seconds plays it again"
         )
-        assert index.lines[job.name]["return"] is None
 
 
 def test_a_start_that_nobody_saw_the_end_of_has_its_seconds(tmp_path: Path) -> None:
