@@ -18,9 +18,9 @@ SAME = Line("cue", 1, "1111111", 3.0, 80.0, 200.0)
         ({"episode_return": 2.39}, ["return below 2.4; the least of 3 lines is 3.0"]),
         ({"episode_return": float("nan")}, ["return below 2.4; the least of 3 lines is 3.0"]),
         ({"updates_per_s": 68.0, "gflops": 170.0}, []),  # a slow hour
-        (
-            {"updates_per_s": 40.0, "gflops": 100.0},  # another machine
-            ["no line is of a machine of about 100 GFLOP/s; --record makes a first one"],
+        *(  # another machine
+            ({"gflops": gflops}, [f"no line is of a machine of about {gflops:.0f} GFLOP/s; --record makes a first one"])
+            for gflops in (100.0, 400.0)
         ),
         ({"updates_per_s": 71.0}, ["speed below 90% of 400.0, the median of 3 lines"]),
         ({"task": "another"}, ["nothing to compare with; --record makes a first line"]),

@@ -131,8 +131,12 @@ def test_no_end_is_told_before_the_learner_learns_or_while_no_steps_come() -> No
 
 def test_no_end_is_told_while_redis_is_away() -> None:
     of = full_status()
-    of.take({"role": "launcher", "time": time.time(), "redis_away_s": 600.0})
+    assert of.eta_s is not None
+    said = {"role": "launcher", "time": time.time(), "start_s": of.get("launcher", "start_s")}
+    of.take(said | {"redis_away_s": 600.0})
     assert of.eta_s is None
+    of.take(said | {"redis_away_s": 0.0})
+    assert of.eta_s is not None
 
 
 def test_what_roles_of_an_earlier_start_said_is_no_rate_of_this_one() -> None:
