@@ -46,6 +46,8 @@ class EnvCall:
     def __exit__(self, *_: object) -> None:
         self.over = True  # another thread may put it back
         EnvCall.current, self._outer = self._outer, None  # calls of several threads would make a chain without end
+        if EnvCall.armed and EnvCall.current is None and self.name == "close":  # a long import may be next
+            _disarm()
 
     def describe(self) -> str:
         """That it hangs, and where, in a line."""
@@ -96,8 +98,8 @@ def _watch() -> None:
         if over and call is not None:
             _end(call)
         if over:  # this process calls none any more
-            EnvCall.armed, arm_at = 0.0, float("-inf")
-            faulthandler.cancel_dump_traceback_later()
+            arm_at = float("-inf")
+            _disarm()
         elif time.monotonic() >= arm_at:
             arm_at = time.monotonic() + (SLACK - 1.0) * seconds
             _arm(seconds)
@@ -106,6 +108,11 @@ def _watch() -> None:
 def _arm(seconds: float) -> None:
     EnvCall.armed = seconds
     faulthandler.dump_traceback_later(SLACK * seconds + LOOK_SECONDS, exit=True, file=STDERR)
+
+
+def _disarm() -> None:
+    EnvCall.armed = 0.0
+    faulthandler.cancel_dump_traceback_later()
 
 
 def _end(call: EnvCall) -> None:

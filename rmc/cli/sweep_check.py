@@ -63,7 +63,7 @@ def check_values(spec: Spec, on_this_machine: bool) -> None:
     search, options = spec.search or Search({}), {name: [value] for name, value in spec.options.items()}
     for name, sought in search.ranges.items():
         if isinstance(sought, Range):
-            is_integer(name, read_job(Job(Path(), ("train", spec.env, *spec.words), 0))[0])
+            is_integer(name, read_job(Job(Path(), ("train", spec.envs[0], *spec.words), 0))[0])
     for part, values in (("options", options), ("grid", spec.grid), ("search", search.ends())):
         for name, tried in values.items():
             for value in tried:
@@ -72,10 +72,10 @@ def check_values(spec: Spec, on_this_machine: bool) -> None:
 
 def _check(place: str, value: Any, spec: Spec, words: list[str]) -> None:
     with contextlib.redirect_stderr(io.StringIO()), contextlib.suppress(SystemExit):
-        parser.parse(["train", spec.env, *words])
+        parser.parse(["train", spec.envs[0], *words])
         return
     told = [without_passwords(word) for word in words]  # the complaint quotes them
-    fault = complaint.about(["train", spec.env, *told], ["sweep", *told])
+    fault = complaint.about(["train", spec.envs[0], *told], ["sweep", *told])
     raise ConfigError(place, value_without_passwords(value), fault)
 
 

@@ -75,7 +75,8 @@ def read_sweep(command: Sweep) -> Spec:
     else:
         search = Search(read_ranges(command.search), command.trials, command.sampler_seed, command.prune)
     seeds = read_seeds(command.seeds or "0")
-    return Spec(command.what, seeds, {}, read_grid(command.grid), search, command.train_words)
+    envs = tuple(env.strip() for env in command.what.split(","))
+    return Spec(envs, seeds, {}, read_grid(command.grid), search, command.train_words)
 
 
 def _check_usual(command: Sweep, names: Sequence[str], fix: str) -> None:
@@ -86,8 +87,8 @@ def _check_usual(command: Sweep, names: Sequence[str], fix: str) -> None:
 
 
 def default_folder(what: str) -> Path:
-    """The same for the same command, so that it goes on."""
-    name = Path(what).stem if what.endswith(".toml") else f"{plain_name(what)}__sweep"
+    """The same for the same command, so that it goes on; of the first environment, so that others may be added."""
+    name = Path(what).stem if what.endswith(".toml") else f"{plain_name(what.partition(',')[0])}__sweep"
     return Path("runs") / name
 
 
@@ -190,10 +191,16 @@ def _count(number: int, what: str) -> str:
 
 def _warn_of_empty_rings(todo: list[Job]) -> None:
     begun = [job for job in todo if (job.folder / "checkpoints" / "epoch").exists()]
-    empty = [job.name for job in begun if not RunFolder(job.folder).rings()]
+    empty = [job.name for job in begun if not RunFolder(job.folder).rings() and not _is_trained(job)]
     if empty:
         names = ", ".join(empty)
         log.warning("without their replay ring, these continue with --warmup-steps that are not trained on: %s", names)
+
+
+def _is_trained(job: Job) -> bool:
+    """Whether only its last evaluation is to be played again."""
+    result = RunFolder(job.folder).result()
+    return result is not None and result["env_steps"] >= sweep_check.read_job(job)[0].total_steps
 
 
 @contextmanager

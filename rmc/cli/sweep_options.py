@@ -16,7 +16,7 @@ class Sweep:
     """
 
     what: Annotated[Positional[str], tyro.conf.arg(metavar="ENV|SPEC.toml")]
-    """An environment as rmc train takes it, or a file with env, seeds, [options], and [grid] or [search]."""
+    """ENV as in rmc train, or ENV,ENV for several, or a file with env, seeds, [options], and [grid] or [search]."""
     seeds: str | None = None
     """Seeds of each value of the grid, like 1-5 or 1,4,7; by default 0."""
     grid: tuple[str, ...] = ()
@@ -30,7 +30,7 @@ class Sweep:
     prune: bool = True
     """Stop a search's runs whose evaluations are below the median of the others'."""
     sweep_dir: Path | None = None
-    """The sweep's folder; by default runs/<SPEC's name>, or runs/<env>__sweep."""
+    """The sweep's folder; by default runs/<SPEC's name>, or runs/<first env>__sweep."""
     jobs: int = 0
     """Runs at once; 0 for as many as cores and memory hold, or one where the device is cuda."""
     drop_replay: bool = False

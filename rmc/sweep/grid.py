@@ -20,15 +20,18 @@ from rmc.sweep.spec import Spec
 
 def grid_jobs(spec: Spec, folder: Path) -> list[Job]:
     """Each value with each other, seed by seed, so that what is compared goes on side by side."""
-    points = [dict(zip(spec.grid, values, strict=True)) for values in product(*spec.grid.values())]
+    varied = {"env": list(spec.envs)} if len(spec.envs) > 1 else {}
+    varied |= spec.grid
+    points = [dict(zip(varied, values, strict=True)) for values in product(*varied.values())]
     return [make_job(spec, folder / run_name(values, seed), values, seed) for seed in spec.seeds for values in points]
 
 
 def make_job(spec: Spec, folder: Path, values: dict[str, Any], seed: int) -> Job:
-    """The run of some values and a seed."""
+    """The run of some values and a seed; of the first environment, where they name none."""
     options = [word for name, value in spec.options.items() for word in option_words(name, value)]
-    own = [word for name, value in values.items() for word in option_words(name, value)]
-    return Job(folder, ("train", spec.env, *options, *spec.words, *own, "--seed", str(seed)), seed, values)
+    own = [word for name, value in values.items() if name != "env" for word in option_words(name, value)]
+    words = ("train", values.get("env", spec.envs[0]), *options, *spec.words, *own, "--seed", str(seed))
+    return Job(folder, words, seed, values)
 
 
 def is_finished(job: Job, config: RunConfig, options: LaunchOptions) -> bool:

@@ -1,6 +1,6 @@
 """What a sweep is asked to run, from a file or from the command line, before any of it is checked as an option.
 
-SPEC.toml: ``env``, ``seeds``, ``[options]`` that every run has, and ``[grid]`` or ``[search]``.
+SPEC.toml: ``env``, one or a list, ``seeds``, ``[options]`` that every run has, and ``[grid]`` or ``[search]``.
 """
 
 import json
@@ -64,7 +64,7 @@ class Search:
 class Spec:
     """A sweep."""
 
-    env: str
+    envs: tuple[str, ...]
     seeds: tuple[int, ...] = (0,)
     options: dict[str, Any] = field(default_factory=dict)
     grid: dict[str, list[Any]] = field(default_factory=dict)
@@ -73,6 +73,7 @@ class Spec:
 
     def __post_init__(self) -> None:
         """Raises ConfigError for names and lists that make no sense; values are judged by the parser of rmc train."""
+        _check_envs(self.envs)
         for name, value in self.options.items():
             check_name(f"options.{name}", name, value, EVERY_RUNS)
         for name, values in self.grid.items():
@@ -96,6 +97,8 @@ class Spec:
     def _check_search(self, search: Search) -> None:
         if self.grid:
             raise ConfigError("grid", sorted(self.grid), "a sweep has a grid or a search; leave one of them")
+        if len(self.envs) != 1:
+            raise ConfigError("env", list(self.envs), "a search has one; start one for each")
         if len(self.seeds) != 1:
             raise ConfigError("seeds", list(self.seeds), "a search has one; repeat its best with more as a grid")
         if not search.ranges:
@@ -112,6 +115,12 @@ class Spec:
                 _check_each_once(f"search.{name}", values)
 
 
+def _check_envs(envs: tuple[str, ...]) -> None:
+    if not envs or not all(isinstance(env, str) and env for env in envs):
+        raise ConfigError("env", list(envs), 'write ENV,ENV, or in a file env = "HalfCheetah-v5" or a list of them')
+    _check_each_once("env", list(envs))
+
+
 def _check_each_once(place: str, values: list[Any]) -> None:
     if len({repr(value) for value in values}) < len(values):
         raise ConfigError(place, values, "has a value twice; give each once, and lists in brackets")
@@ -121,7 +130,7 @@ def check_name(place: str, name: str, value: Any, names: Set[str] = NAMES) -> No
     """Raises ConfigError where that is no option that a sweep's runs may have."""
     told = value_without_passwords(value)
     if name == "env":
-        raise ConfigError(place, told, "a sweep has one environment; start one for each")
+        raise ConfigError(place, told, "give ENV,ENV in place of ENV, or in a file env = [ENV, ENV]")
     if name in OWN:
         raise ConfigError(place, told, "every run has its own; give env and seeds")
     if name not in names:
@@ -139,15 +148,14 @@ def read_spec(path: Path, words: Sequence[str]) -> Spec:
     """A sweep from its file. Raises ConfigError, which names the key."""
     raw = read_toml("SPEC", path, "give a .toml file or an environment")
     _check_keys("", raw, KEYS)
-    if not isinstance(raw.get("env"), str):
-        raise ConfigError("env", raw.get("env"), f'write an environment into {path}, like env = "HalfCheetah-v5"')
     for part in ("options", "grid", "search"):
         if not isinstance(raw.get(part, {}), dict):
             raise ConfigError(part, raw[part], f"write it as a table, [{part}]")
     search = _search(raw["search"]) if "search" in raw else None
     seeds = read_seeds(raw.get("seeds", 0))
     options, grid = (plain_names(f"{part}.", raw.get(part, {})) for part in ("options", "grid"))
-    return Spec(raw["env"], seeds, options, grid, search, tuple(words))
+    envs = raw.get("env", [])
+    return Spec(tuple(envs) if isinstance(envs, list) else (envs,), seeds, options, grid, search, tuple(words))
 
 
 def _check_keys(place: str, raw: dict[str, Any], names: Sequence[str]) -> None:

@@ -1,4 +1,4 @@
-"""How a sweep's runs did, by their values, best first."""
+"""How a sweep's runs did, by environment and values, best first."""
 
 from collections.abc import Sequence
 
@@ -16,7 +16,10 @@ def result_table(jobs: Sequence[Job], index: Index) -> Table:
     for job in jobs:
         points.setdefault(job.name if job.is_trial else repr(job.values), []).append(job)
     names = list(jobs[0].values)
-    rows = sorted((_row(runs, index, names) for runs in points.values()), key=lambda row: -row[0])
+    by_env: dict[str, list[tuple[float, list[str]]]] = {}
+    for runs in points.values():
+        by_env.setdefault(runs[0].values.get("env", ""), []).append(_row(runs, index, names))
+    rows = [row for each in by_env.values() for row in sorted(each, key=lambda row: -row[0])]
     table = Table(box=None, pad_edge=False)
     whole = all(not cells[-1] for _, cells in rows)
     columns = ["trial" if jobs[0].is_trial else "", *names, "seeds", "return", "not finished"]

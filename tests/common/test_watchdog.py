@@ -57,6 +57,13 @@ def test_calls_that_return_may_be_many_and_time_between_them_does_not_count() ->
     )[:2] == (0, "")
 
 
+@pytest.mark.parametrize(("name", "status"), [("close", 0), ("step", 1)])
+def test_what_keeps_pythons_lock_after_an_environment_is_closed_has_not_hung(name: str, status: int) -> None:
+    """An import of torch on a slow disk; after a step it would have."""
+    code = f"start()\nwith EnvCall('Mine-v0', {name!r}, 0.5): time.sleep(0.2)\nctypes.PyDLL(None).sleep(2)"
+    assert run(code)[0] == status
+
+
 def test_in_a_users_own_process_it_is_a_warning_once_and_nothing_ends() -> None:
     status, output, _ = run("warn()\nwarn()\ncall = EnvCall('Mine-v0', 'step', 0.5)\n\nwith call: time.sleep(2)")
     assert (status, output) == (0, LINE.removeprefix("rmc: ").replace("line 5", "line 7"))

@@ -34,7 +34,7 @@ RANGES: dict[str, Range | list[Any]] = {
 
 
 def spec_of(trials: int = 20, **kwargs: Any) -> Spec:
-    return Spec("InvertedPendulum-v5", words=("--preset", "debug"), search=Search(RANGES, trials, **kwargs))
+    return Spec(("InvertedPendulum-v5",), words=("--preset", "debug"), search=Search(RANGES, trials, **kwargs))
 
 
 def work_of(folder: Path, index: Index, spec: Spec) -> Any:
@@ -171,7 +171,7 @@ def test_other_ranges_than_those_of_its_trials_are_refused(tmp_path: Path, index
     work = work_of(tmp_path, index, spec_of())
     play(work, index, [1.0] * 4)
     for ranges in ({"learning_rate": Range(0.5, 0.6)}, RANGES | {"n_step": Range(8, 9)}, RANGES | {"scheme": [1]}):
-        spec = Spec("InvertedPendulum-v5", words=("--preset", "debug"), search=Search(ranges))
+        spec = Spec(("InvertedPendulum-v5",), words=("--preset", "debug"), search=Search(ranges))
         with pytest.raises(ConfigError, match=r"trial-0 has .* which these ranges do not hold"):
             work_of(tmp_path, index, spec)
 
@@ -187,13 +187,13 @@ def test_a_trials_folder_without_its_line_is_not_gone_on_with(tmp_path: Path, in
 def test_a_search_that_goes_on_has_the_options_of_its_trials(tmp_path: Path, index: Index) -> None:
     work = work_of(tmp_path, index, spec_of())
     play(work, index, [1.0] * 4, finished=False)
-    spec = Spec("InvertedPendulum-v5", words=("--preset", "debug", "--gamma", "0.9"), search=Search(RANGES))
+    spec = Spec(("InvertedPendulum-v5",), words=("--preset", "debug", "--gamma", "0.9"), search=Search(RANGES))
     with pytest.raises(ConfigError, match=r"^--gamma=0.9: the run in .*trial-0 has 0.99; use that"):
         work_of(tmp_path, index, spec)
 
 
 def test_a_range_is_of_numbers(tmp_path: Path, index: Index) -> None:
-    spec = Spec("InvertedPendulum-v5", search=Search({"grounding": Range(0, 1)}))
+    spec = Spec(("InvertedPendulum-v5",), search=Search({"grounding": Range(0, 1)}))
     with pytest.raises(ConfigError, match=r"search\.grounding=True: only numbers have a range"):
         work_of(tmp_path, index, spec)
 

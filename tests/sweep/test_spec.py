@@ -47,6 +47,35 @@ def test_options_of_train_come_after_the_environment_or_the_file(tmp_path: Path)
         assert (config.agent.heads, config.env.env_kwargs, config.preset) == ((8, 8), {"a": 1, "b": 2}, "debug")
 
 
+def test_environments_are_told_apart_by_commas_or_a_list(tmp_path: Path) -> None:
+    path, envs = tmp_path / "spec.toml", (PENDULUM, "dm_control/walker-walk-v0")
+    path.write_text(f"env = {list(envs)}\nseeds = [1, 2]\n[options]\npreset = 'debug'\n[grid]\nscheme = [1, 3]\n")
+    words = spec_of(", ".join(envs), "--seeds", "1,2", "--grid", "scheme=1,3", "--preset", "debug")
+    ours, theirs = grid_jobs(read_spec(path, []), tmp_path), grid_jobs(words, tmp_path)
+    configs = [sweep_check.read_job(job)[0] for job in ours]
+    assert configs == [sweep_check.read_job(job)[0] for job in theirs]
+    runs = [(config.env.id, config.seed, config.update.scheme) for config in configs]
+    assert runs == [(env, seed, scheme) for seed in (1, 2) for env in envs for scheme in (1, 3)]
+    assert [job.name for job in ours] == [job.name for job in theirs]
+    assert ours[0].name == f"env={PENDULUM},scheme=1,seed=1"
+    assert ours[0].title == f"env {PENDULUM}, scheme 1, seed 1"
+    assert default_folder(",".join(envs)) == default_folder(PENDULUM)  # to which others may be added
+
+
+def test_of_several_environments_a_bad_one_is_named(tmp_path: Path) -> None:
+    jobs = grid_jobs(spec_of(f"{PENDULUM},Nope-v5", "--preset", "debug"), tmp_path)
+    with pytest.raises(ConfigError, match=r"^ENV='Nope-v5': no such environment"):
+        sweep_check.check_jobs(jobs, on_this_machine=True)
+
+
+@pytest.mark.parametrize("env", ["[]", "1", '["Ant-v5", 3]', '""', '["Ant-v5", "Ant-v5"]', "true"])
+def test_what_are_no_environments(env: str, tmp_path: Path) -> None:
+    path = tmp_path / "spec.toml"
+    path.write_text(f"env = {env}\n")
+    with pytest.raises(ConfigError, match=r"^env=\[.*\]: (write ENV,ENV|has a value twice)"):
+        read_spec(path, [])
+
+
 @pytest.mark.parametrize(
     ("raw", "seeds"), [("1-3,7", (1, 2, 3, 7)), ("4", (4,)), ([5, 2], (5, 2)), (6, (6,)), (" 1 , 2", (1, 2))]
 )
@@ -107,7 +136,7 @@ FILES = {
     "options = 1": "options=1: write it as a table",
     "[options]\ntotal_step = 5": "options.total_step=5: no option that a sweep's runs take; did you mean total_steps?",
     "[options]\nseed = 5": "options.seed=5: every run has its own",
-    '[grid]\nenv = ["Hopper-v5", "Ant-v5"]': "grid.env=['Hopper-v5', 'Ant-v5']: a sweep has one environment; start one",
+    '[grid]\nenv = ["Hopper-v5", "Ant-v5"]': "grid.env=['Hopper-v5', 'Ant-v5']: give ENV,ENV in place of ENV, or in a",
     '[options]\nrun_dir = "x"': "options.run_dir='x': no option that a sweep's runs take",
     '[options]\nredis_url = "redis://:pw@x"': "options.redis_url='redis://x': no option that a sweep's runs take",
     '[grid]\nactors = ["redis://:pw@x"]': "grid.actors='redis://x': Error parsing --actors: 'redis://x' is no whole",
@@ -169,6 +198,8 @@ def test_an_option_that_a_table_names_twice_is_refused(table: str, tmp_path: Pat
         ([], "ENV|SPEC.toml"),
         (["nowhere.toml"], "SPEC='nowhere.toml': cannot be read (No such file"),
         (["Nope-v5"], "no such environment"),
+        ([f"{PENDULUM},"], f"env=['{PENDULUM}', '']: write ENV,ENV"),
+        ([f"{PENDULUM},Ant-v5", "--search", "n_step=1..3"], f"env=['{PENDULUM}', 'Ant-v5']: a search has one"),
         ([PENDULUM, "--sede", "1"], "options of rmc train='--sede 1': Unrecognized options: --sede"),
         ([PENDULUM, "other"], "options of rmc train='other': Unrecognized options: other"),
         ([PENDULUM, "--run-dir", "x"], "--run-dir='--run-dir x': a sweep's runs are given none"),

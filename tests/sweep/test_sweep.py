@@ -18,7 +18,7 @@ from rich.console import Console
 from rmc.cli import parser, sweep_command
 from rmc.cli.main import run
 from rmc.cli.sweep_check import Checked, as_planned, check_jobs, check_values, read_job
-from rmc.cli.sweep_command import _count, grid_work, read_sweep
+from rmc.cli.sweep_command import _count, _warn_of_empty_rings, grid_work, read_sweep
 from rmc.common.errors import ConfigError
 from rmc.common.process.role import StopSignal
 from rmc.common.return_text import return_text
@@ -250,7 +250,9 @@ def test_a_run_that_was_trained_for_longer_is_no_result_of_fewer_steps(tmp_path:
         is_finished(job, fewer, options)
 
 
-def test_a_last_evaluation_that_was_cut_is_played_again_with_more_time(tmp_path: Path) -> None:
+def test_a_last_evaluation_that_was_cut_is_played_again_with_more_time(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     """With the same time it would be cut again; where other options differ the run could not go on."""
     job = made(tmp_path / "sweep" / "seed=0")
     folder = RunFolder(job.folder)
@@ -260,6 +262,12 @@ def test_a_last_evaluation_that_was_cut_is_played_again_with_more_time(tmp_path:
     longer = dataclasses.replace(config, evaluator=dataclasses.replace(config.evaluator, evaluation_seconds=900.0))
     assert not is_finished(job, longer, options)
     assert is_finished(job, dataclasses.replace(longer, actors=2), options)
+    (folder.checkpoints / "epoch").write_text("1")
+    _warn_of_empty_rings([job])
+    assert not caplog.records  # nothing more is trained
+    more = dataclasses.replace(job, words=(*job.words, "--total-steps", "9999999"))
+    _warn_of_empty_rings([more])
+    assert "these continue with --warmup-steps that are not trained on: seed=0" in caplog.text
     with closing(Index(job.folder.parent)) as index:
         index.put(job, "finished")
         assert run_line(job, index) == (
@@ -376,6 +384,19 @@ def test_seeds_deviate_as_a_sample_does(tmp_path: Path) -> None:
         (cell,) = next(column.cells for column in result_table(jobs, index).columns if column.header == "return")
     assert cell == "0.5000 ± 0.0566"
     assert [line.partition(" after")[0].partition(": ")[2] for line in words] == ["return 0.46", "return 0.54"]
+
+
+def test_a_table_is_by_environment_and_best_first_there(tmp_path: Path) -> None:
+    points = [{"env": env, "scheme": scheme} for env in ("Hopper-v5", "Ant-v5") for scheme in (1, 3)]
+    jobs = [Job(tmp_path / str(at), (), 0, values) for at, values in enumerate(points)]
+    with closing(Index(tmp_path)) as index:
+        for job, mean in zip(jobs, (10.0, 30.0, 40.0, 20.0), strict=True):
+            index.put(job, "finished")
+            index.lines[job.name]["return"] = mean
+        columns = result_table(jobs, index).columns
+    cells = {column.header: list(column.cells) for column in columns}
+    assert cells["env"] == ["Hopper-v5", "Hopper-v5", "Ant-v5", "Ant-v5"]
+    assert cells["scheme"] == ["3", "1", "1", "3"]
 
 
 def test_a_trials_values_stand_under_their_names(tmp_path: Path) -> None:
