@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rmc.analysis.policy import Policy, load_policy
-    from rmc.api import evaluate, resume, train
+    from rmc.api import evaluate, load_config, resume, train
     from rmc.common.env.config import EnvConfig
     from rmc.common.errors import ConfigError, RmcError
     from rmc.deploy.run import presets
@@ -30,6 +30,7 @@ __all__ = [
     "RmcError",
     "RunConfig",
     "evaluate",
+    "load_config",
     "load_policy",
     "presets",
     "resume",
@@ -43,6 +44,7 @@ _HOMES = {
     "RmcError": "rmc.common.errors",
     "RunConfig": "rmc.deploy.run.config",
     "evaluate": "rmc.api",
+    "load_config": "rmc.api",
     "load_policy": "rmc.analysis.policy",
     "resume": "rmc.api",
     "train": "rmc.api",

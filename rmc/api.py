@@ -1,4 +1,4 @@
-"""What the commands ``rmc train``, ``rmc resume`` and ``rmc evaluate`` do, as functions for scripts and notebooks."""
+"""What ``rmc train``, ``rmc resume`` and ``rmc evaluate`` do, and a run's config, for scripts and notebooks."""
 
 import os
 import signal
@@ -84,6 +84,11 @@ def train(
         metrics_host=metrics_host,
     )
     return _train(config, options, callback)
+
+
+def load_config(run_dir: str | Path) -> RunConfig:
+    """The options of a run, also of an older version: to read, or to change and give to ``train``. Raises ConfigError."""
+    return RunFolder(user_path(run_dir)).config()
 
 
 def resume(

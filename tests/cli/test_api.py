@@ -141,6 +141,15 @@ def test_a_tilde_is_the_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         rmc.train(CONFIG, tmp_path / "other", init_from="~/run")
 
 
+def test_a_runs_config_is_what_it_was_trained_with(tmp_path: Path) -> None:
+    config = dataclasses.replace(CONFIG, seed=7, env=rmc.EnvConfig("InvertedPendulum-v5", env_kwargs={"frame_skip": 3}))
+    untrained(tmp_path / "run", config)
+    assert rmc.load_config(tmp_path / "run") == rmc.load_config(str(tmp_path / "run")) == config
+    (tmp_path / "run" / "config.json").write_text("{")
+    with pytest.raises(rmc.ConfigError, match=r"config\.json.*not JSON"):
+        rmc.load_config(tmp_path / "run")
+
+
 def test_what_is_no_config_is_refused() -> None:
     with pytest.raises(rmc.ConfigError, match=r"^config='Ant-v5': take a RunConfig"):
         rmc.train("Ant-v5")  # type: ignore[arg-type]

@@ -142,7 +142,8 @@ def test_its_commands_run(tmp_path: Path) -> None:
 def test_the_python_api_runs(tmp_path: Path) -> None:
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "python-api.md").read_text(), re.DOTALL)
     assert {name for block in blocks for name in re.findall(r"import (.*)", block)} >= {
-        "EnvConfig, presets", "EnvConfig, presets, train", "evaluate", "load_policy",
+        "EnvConfig, presets", "EnvConfig, presets, train", "evaluate", "load_config, train",
+        "load_policy",
     }  # fmt: skip
     assert all(len(block.strip().splitlines()) <= 6 for block in blocks)
     code = "\n".join(blocks)
@@ -150,6 +151,7 @@ def test_the_python_api_runs(tmp_path: Path) -> None:
         ('train(config, "runs/first"', 'train(config := dataclasses.replace(config, total_steps=700), "runs/first"'),
         ("callback=stop_when_good", "callback=stop_when_good, launcher='lockstep'"),
         ("total_steps=4500,", "total_steps=900, launcher='lockstep',"),
+        ('total_steps=5000), "runs/first"', 'total_steps=1000), "runs/first", launcher="lockstep"'),
     ):
         assert code.count(printed) == 1
         code = code.replace(printed, shorter)
