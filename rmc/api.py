@@ -87,7 +87,7 @@ def train(
 
 
 def load_config(run_dir: str | Path) -> RunConfig:
-    """The options of a run, also of an older version, to read or to change and give to ``train``. Raises ConfigError."""
+    """The options of a run, also an older one; to be read, or changed and given to ``train``. Raises ConfigError."""
     return RunFolder(user_path(run_dir)).config()
 
 
