@@ -180,7 +180,7 @@ def _conduct(command: Sweep, work: Work, checked: list[Checked], index: Index) -
     remaining = work.total - sum(index.state(job) in OVER for job in work.jobs)
     if remaining:
         console.print(
-            f"{remaining} not over; the same command goes on; {folder / NAME} has their words", soft_wrap=True
+            f"{remaining} not finished; the same command continues them; {folder / NAME} says why", soft_wrap=True
         )
     return STOPPED_STATUS if stop.requested else int(remaining > 0)
 

@@ -10,7 +10,7 @@ from tyro.conf import Positional
 
 @dataclass(frozen=True)
 class Sweep:
-    """Train many runs: a grid's values with each seed, or a search; the same command continues it.
+    """Train many runs: environments and a grid's values with each seed, or a search; the same command continues it.
 
     Options for every run follow ENV or SPEC, as in rmc train.
     """

@@ -127,7 +127,7 @@ def test_a_run_that_fails_is_told_with_its_last_words(tmp_path: Path) -> None:
         r"^\d of 2: seed 1: failed: .*is no run's folder; give another one; see ", sweep.text(), re.MULTILINE
     )
     assert "1 failed" in sweep.text()
-    assert "1 not over; the same command goes on; " in sweep.text()
+    assert "1 not finished; the same command continues them; " in sweep.text()
     assert (folder / "seed=1" / "thesis.tex").exists()
 
 
