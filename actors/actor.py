@@ -29,7 +29,7 @@ from rmc.common.window import Floats, Rows, WindowSpec
 log = logging.getLogger(__name__)
 POLL_SECONDS = 0.02  # between looks at the bus while there is nothing to do but wait
 RESEND_SECONDS = 5.0  # without a new acknowledgement before everything unacknowledged is sent again
-DOUBT_SECONDS = 10.0  # that an older acknowledgement than the last is not believed; the replay repeats its own sooner
+DOUBT_SECONDS = 10.0  # for which an acknowledgement older than the last is ignored; the replay repeats its own sooner
 _NOISE, _RATING = -1, -2  # seeds beside the environments': of exploration, and of how windows are rated
 
 
@@ -200,9 +200,9 @@ class Actor:
         if newest is None:
             return
         try:
-            self._runner.load(newest[1])
             if self._priority_fn is not None:
-                self._priority_fn.load(newest[1])
+                self._priority_fn.load(newest[1])  # first: a refused policy does not act
+            self._runner.load(newest[1])
         except MessageError as error:
             self._refused_weights += 1
             self._refused = newest[0]

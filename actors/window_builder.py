@@ -16,7 +16,7 @@ from rmc.common.window import BoolArray, Floats, Rows, WindowSpec
 
 
 class Now(NamedTuple):
-    """What a policy acts on; views that the next ``add`` but T overwrites."""
+    """What a policy acts on; views that are valid for T more calls of ``add``."""
 
     observation: Floats  # (N, O)
     prev_action: Floats  # (N, A)

@@ -79,7 +79,7 @@ WHEN = {
     "gate_init": "`chrono` where something seen once is needed many steps later; the preset `memory` has it",
     "head_input": "`hidden` where the memory must do alone; `observation`, with "
     "`--scheme 2 --no-grounding --hidden 8 --embedding 0`, where all is seen and time counts: "
-    "[far behind by 300 000 steps](results.md)",
+    "[far behind the other two by 300 000 steps](results.md)",
     "critic_batch_norm": "off for target critics, and with batches below 16: [what it is worth](results.md)",
     "privileged_critic": "where the simulator knows what sensors do not see: "
     "[an environment of your own](custom-environments.md#seen-in-part)",

@@ -24,7 +24,7 @@ class UpdateConfig:
     polyak: float = 0.995
     """Share of itself that a target network keeps at every update."""
     clip_norm: float = 0.0
-    """Largest global gradient norm; 0 does not clip."""
+    """Largest gradient norm of an optimiser's step; 0 does not clip."""
     latent_target: Literal["online", "ema"] = "online"
     """Which memory gives the change that the world model predicts."""
     target_memory: Literal["online", "ema"] = "online"

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from rmc.common.agent import Agent, squashed_sample
-from rmc.common.agent_config import AgentConfig
+from rmc.common.agent_config import CRITIC_PARTS, AgentConfig
 from rmc.common.critic import critic_input
 from rmc.common.errors import MessageError
 from rmc.common.window import Rows, WindowSpec
@@ -37,9 +37,11 @@ class InitialPriority:
     def load(self, blob: bytes) -> None:
         """Take over what was broadcast, the safetensors of ``Agent.broadcast_weights()``. Raises MessageError."""
         try:
-            self._agent.load_state_dict(safetensors.torch.load(blob), strict=False)
+            lacking = self._agent.load_state_dict(safetensors.torch.load(blob), strict=False).missing_keys
         except (safetensors.SafetensorError, RuntimeError) as error:
             raise MessageError("weights", f"not of this run ({error})") from None
+        if critics := [name for name in lacking if name.startswith(CRITIC_PARTS)]:
+            raise MessageError("weights", f"without critics ({critics[0]})")
 
     @torch.no_grad()
     def __call__(self, rows: Rows) -> NDArray[np.float32]:

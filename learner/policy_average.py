@@ -26,10 +26,7 @@ class PolicyAverage:
 
     @torch.no_grad()
     def update(self, updates: int, parts: tuple[str, ...] = ("",)) -> None:
-        """After so many updates, the average of parameters whose names begin so; every ``MOVE_UPDATES``.
-
-        The newest before.
-        """
+        """Every ``MOVE_UPDATES`` updates, move the average of parameters whose names begin so; before, copy them."""
         if self._values and (updates < MOVE_UPDATES or updates % MOVE_UPDATES == 0):
             over, acting = min(self._updates, updates / 10) / MOVE_UPDATES, self._agent.acting()
             names = [name for name in self._values if name.startswith(parts)]

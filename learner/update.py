@@ -31,7 +31,7 @@ from rmc.learner.unroll import impute_and_unroll, unroll
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
 MODEL_PARTS = ("memory", "world_model", "next_frame")
 ACTOR_CRITIC_PARTS = ("critic", "policy", "log_alpha")
-IMPUTER_UPDATES = 8  # updates for one of the imputer's until a frame is missing: no loss reads it before
+IMPUTER_UPDATES = 8  # for one of the imputer's, until a frame is missing: before that its output is unused
 TRAINS_MEMORY = {  # the paper's table 1
     1: {"model", "value"},
     2: {"value"},

@@ -11,7 +11,7 @@ from rmc.common.compiled import compiled
 from rmc.common.replay import ObservationStatistics
 from rmc.common.window import Rows, WindowSpec
 
-SETTLED = 1_000  # observations from which on the sums tell what a number may be
+SETTLED = 50  # observations from which on the sums tell what a number may be
 FARTHEST = 100.0  # standard deviations from the mean that one counts as at most
 
 

@@ -186,7 +186,8 @@ def reserve(path: Path, size: int, capacity: int) -> None:
             os.ftruncate(handle, size)
     except OSError as error:
         path.unlink()
-        fix = f"needs {size / 2**30:.2f} GiB in {path.parent} ({error.strerror}); lower it or choose another --run-dir"
+        need = f"so many windows of a replay server need {size / 2**30:.2f} GiB in {path.parent} ({error.strerror})"
+        fix = f"{need}; lower it or choose another --run-dir"
         raise ConfigError("--capacity", capacity, fix) from None
     finally:
         os.close(handle)

@@ -13,6 +13,7 @@ from rmc.common.process.outage import OutageLog
 
 METRICS_PERIOD = 1.0  # seconds between a role's metrics records, which are its heartbeat too
 STOP_PERIOD = 0.5  # seconds between looks at the bus's stop key
+STOP_LOOKS = 3  # that find it: a Redis restored to an earlier start has that start's, until the launcher looks
 TERMINATED_STATUS = 128 + signal.SIGTERM  # a shell's word for it
 IDLE_SECONDS = 0.002  # slept after a step that had nothing to do
 RECONNECT_SLEEP = 0.5  # seconds between tries while Redis is away or full
@@ -71,6 +72,7 @@ class Heartbeat:
         self._role, self._bus, self._clock = role, bus, clock
         self.outage = OutageLog(role.name)
         self._next_metrics = self._next_stop = 0.0
+        self._stops_seen = 0  # in a row
         self._unsent: dict[str, Any] = {}  # taken from the role, which does not say it twice
 
     def stop_requested(self) -> bool:
@@ -79,7 +81,8 @@ class Heartbeat:
         try:
             if now >= self._next_stop:
                 self._next_stop = now + STOP_PERIOD
-                if self._bus.stop_requested() is not None:
+                self._stops_seen = self._stops_seen + 1 if self._bus.stop_requested() is not None else 0
+                if self._stops_seen == STOP_LOOKS:
                     return True
             if now >= self._next_metrics:
                 self._next_metrics = now + METRICS_PERIOD

@@ -9,7 +9,7 @@ from typing import Any
 
 import ray
 from ray.util.placement_group import placement_group, remove_placement_group
-from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
+from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy, PlacementGroupSchedulingStrategy
 
 from rmc.common.errors import RoleDied
 from rmc.common.shard import WHOLE
@@ -17,7 +17,7 @@ from rmc.deploy.local.role_environment import URL_VARIABLE, working_folder
 from rmc.deploy.local.role_process import QUICK_DEATHS
 from rmc.deploy.ray.placement import LEARNER, RolePlacement, groups, nodes_by_room, places
 from rmc.deploy.ray.ring_nodes import RingLocations
-from rmc.deploy.ray.role_actor import NAMESPACE, Task, actor_name, is_for_now
+from rmc.deploy.ray.role_actor import NAMESPACE, Task, actor_name, clear_scratch, is_for_now
 from rmc.deploy.ray.role_handle import RoleHandle
 from rmc.deploy.redis.connect import PATIENCE_VARIABLE
 from rmc.deploy.run import tls
@@ -27,7 +27,7 @@ from rmc.deploy.run.launch_options import users_path
 
 LOST_SECONDS = 120.0  # within which a role's host may be lost for good twice
 PATIENCE_SECONDS = 120.0  # of a role that starts while launcher and Redis are being started again
-CLOSE_SECONDS, CLEAR_SECONDS = 10.0, 5.0  # for hosts to end, and to remove what is left on their nodes
+CLOSE_SECONDS, CLEAR_SECONDS = 10.0, 10.0  # for hosts to end, and to remove what is left on all nodes
 NOTICE_SECONDS = 2.0  # for them to hear that the run ends
 HEAR_SECONDS = 0.05  # between looks for an answer
 log = logging.getLogger(__name__)
@@ -184,12 +184,18 @@ class Hosts:
         """End all; of a run that is ``over`` nothing is left on the nodes. ``saving``: seconds of a checkpoint."""
         _wait([one.handle.close.remote() for one in self._handles.values() if one.awaited], CLOSE_SECONDS + saving)
         if over and not self._kept_elsewhere():
-            heard = [one for one in self._handles.values() if one.report is not None]
-            _wait([one.handle.clear.remote() for one in heard], CLEAR_SECONDS)
+            _wait(self._cleared(), CLEAR_SECONDS)
         for one in self._handles.values():
             ray.kill(one.handle, no_restart=True)
         for group in self._groups.values():
             remove_placement_group(group)
+
+    def _cleared(self) -> list[Any]:
+        """Of every node, also of those that roles have left."""
+        nodes = [node["NodeID"] for node in ray.nodes() if node["Alive"]]
+        there = (NodeAffinitySchedulingStrategy(node, soft=False) for node in nodes)
+        clear = ray.remote(num_cpus=0)(clear_scratch)
+        return [clear.options(scheduling_strategy=node).remote(self._folder.name) for node in there]
 
     def _kept_elsewhere(self) -> bool:
         """Whether something of the run is on a node alone, where its hosts share a folder."""

@@ -17,7 +17,6 @@ from rmc.deploy.ray.role_actor import (
     SETTLE_SECONDS,
     RoleActor,
     actor_name,
-    is_full,
 )
 
 
@@ -88,7 +87,7 @@ class LearnerActor(RoleActor):
             try:
                 self.tend()
                 return
-            except AWAY as error:
-                if is_full(str(error)) and not (self._run_ends or self._replaced):  # the head, until it has room
+            except AWAY:
+                if not (self._run_ends or self._replaced):  # the head is waited for: it may lack room, or be away
                     deadline = time.monotonic() + SETTLE_SECONDS
                 time.sleep(LOOK_SECONDS)

@@ -28,8 +28,7 @@ ENDED_IN_ORDER = 0
 STOP_SECONDS = 5.0
 SETTLE_SECONDS = 60.0  # for the last checkpoint to reach the head
 CLAIM_SECONDS = 60.0  # for a launcher that is being started again
-FULL = tuple(map(os.strerror, NO_ROOM))
-FOR_NOW = (*FULL, *map(os.strerror, NO_PROCESS), "can't start new thread")
+FOR_NOW = (*map(os.strerror, (*NO_ROOM, *NO_PROCESS)), "can't start new thread")
 AWAY = (ray.exceptions.RayError, ValueError, CheckpointError, OSError)  # of who keeps the checkpoints
 
 
@@ -69,21 +68,24 @@ class RoleReport:
     """What keeps it from bringing to the head what belongs there; empty where all is there."""
 
 
-def scratch_folder(name: str) -> Path:
+def scratch_folder(run: str) -> Path:
     """Where this node keeps what a run's roles need at hand. Raises RuntimeError where it is somebody else's.
 
     Short, for the sockets in it; the run's folder itself lies with its launcher, on the head.
     """
-    return private_folder(Path(tempfile.gettempdir()) / f"rmc-ray-{os.getuid()}-{name}")
+    return private_folder(Path(tempfile.gettempdir()) / f"rmc-ray-{os.getuid()}-{run.rpartition('-')[2]}")
 
 
-def is_full(error: str) -> bool:
-    """Whether it is a disk without room, by an error's text, which is all that Ray brings from another node."""
-    return any(words in error for words in FULL)
+def clear_scratch(run: str) -> None:
+    """Remove what a run that is over keeps on this node."""
+    shutil.rmtree(scratch_folder(run), ignore_errors=True)
 
 
 def is_for_now(error: str) -> bool:
-    """Whether a node has no room on its disk, no process or no memory to give now, likewise by an error's text."""
+    """Whether a node has no room on its disk, no process or no memory to give now.
+
+    By an error's text, which is all that Ray brings from another node.
+    """
     return any(words in error for words in FOR_NOW)
 
 
@@ -101,7 +103,7 @@ class RoleActor:
         descendants.spare_children()  # Ray's own
         self._replaced = self._run_ends = False
         self.trouble = ""
-        self.scratch = scratch_folder(task.run.rpartition("-")[2])
+        self.scratch = scratch_folder(task.run)
         self._write_secrets()
         self._status: int | None = None
         self.prepare()
@@ -191,10 +193,6 @@ class RoleActor:
             self._incarnation, ray.util.get_node_ip_address(), self._role.pid, self._status, words, log,
             start + len(log), self.trouble,
         )  # fmt: skip
-
-    def clear(self) -> None:
-        """Remove what the run keeps on this node."""
-        shutil.rmtree(self.scratch, ignore_errors=True)
 
     def restart(self) -> None:
         """End the role cleanly and start it again, because the run's config has changed."""

@@ -9,7 +9,7 @@ from rmc.deploy.redis.progress_backup import ProgressBackup
 from rmc.deploy.run.config import RunConfig, to_registration
 from rmc.deploy.run.folder import RunFolder
 
-LOOK_SECONDS = 1.0
+LOOK_SECONDS = 0.5  # less than a role takes to believe in a stop
 KEPT_SECONDS = 3600  # in Redis, after the end
 
 

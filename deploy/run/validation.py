@@ -108,6 +108,9 @@ def validate_new(config: RunConfig) -> None:
         raise ConfigError(
             "--missing-flag", True, "the memory reads it, and --head-input observation has none; leave it"
         )
+    if config.update.n_step > window.trained_steps and strategy != "episode":
+        fix = f"a return has as many steps as are trained: take at most --trained-steps={window.trained_steps}"
+        raise ConfigError("--n-step", config.update.n_step, fix)
     validate_new_env(config.env)
 
 

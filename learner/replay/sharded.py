@@ -69,13 +69,14 @@ class ShardedReplay:
         assert batch_size == self._batch_size, (batch_size, self._batch_size)
         while (live := self._live()).any():
             parts = live.astype(np.int64) if self._parts is None else self._parts  # one of each: totals are known then
-            draws = [
+            draws = (
                 stock.fill(part, drawn_elsewhere_steps + self._drawn_outside(stock))
                 for stock, part in zip(self._stocks, parts.tolist(), strict=True)
-            ]
-            if SampleStatus.FINISHED in draws:
+            )  # one that hangs holds the learner for seconds: no other is asked then
+            status = next((draw for draw in draws if draw is not SampleStatus.BATCH), SampleStatus.BATCH)
+            if status is SampleStatus.FINISHED:
                 self._parts = None
-            elif SampleStatus.WAIT in draws:
+            elif status is SampleStatus.WAIT:
                 return self._sample(SampleStatus.WAIT)
             elif self._parts is None:
                 self._parts = self._apportion(live)
@@ -127,8 +128,12 @@ class ShardedReplay:
 
     def statistics(self) -> ObservationStatistics | None:
         """The sums over all shards; None while one is away."""
-        statistics = [of_shard for stock in self._stocks if (of_shard := stock.replay.statistics()) is not None]
-        return sum(statistics[1:], statistics[0]) if len(statistics) == len(self._stocks) else None
+        total = self._stocks[0].replay.statistics()
+        for stock in self._stocks[1:]:
+            if total is None or (of_shard := stock.replay.statistics()) is None:
+                return None
+            total += of_shard
+        return total
 
     def episode(self, serial: int) -> Rows | None:
         """The windows of one episode, which are all in one shard."""

@@ -51,8 +51,7 @@ def _forked(requests: socket.socket, request: dict[str, Any], log: int) -> int:
     fork_server = os.getpid()
     try:
         pid = os.fork()
-    except OSError as error:
-        os.write(log, f"no process can be forked: {error.strerror}\n".encode())
+    except OSError:
         return 0
     if pid == 0:
         requests.close()

@@ -270,6 +270,19 @@ def test_a_run_learns_is_stopped_and_goes_on(site: Site) -> None:
     assert "is lost" not in site.head.run(f"cat {again.folder}/logs/replay.log").stdout
 
 
+def test_a_run_that_is_over_leaves_nothing_also_where_its_roles_have_been_before(site: Site) -> None:
+    run, found, machines = Run(site, "over", "--preset", "debug", "--total-steps", "3000"), "", site.machines.machines
+    while not found:
+        assert run.process.poll() is None, run.text()
+        places = [machine.run("ls -d /tmp/rmc-ray-0-*", check=False).stdout.strip() for machine in machines]
+        found = next(filter(None, places), "")
+    for machine in machines:
+        machine.run(f"mkdir -p -m 700 {found}")
+    output, _ = run.process.communicate(timeout=180)
+    assert run.process.returncode == 0, output
+    assert [machine.run(f"ls -d {found}", check=False).stdout for machine in machines] == [""] * len(machines)
+
+
 def test_a_killed_raylet_costs_no_acknowledged_window(endless: Run) -> None:
     learner, site = where(endless, "learner"), endless.site
     worker = site.beta if learner is site.alpha else site.alpha

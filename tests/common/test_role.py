@@ -6,7 +6,7 @@ import pytest
 
 from rmc.common.bus.memory_bus import MemoryBus
 from rmc.common.errors import BusFull, BusUnavailable, ConfigError
-from rmc.common.process.role import StopSignal, run_role
+from rmc.common.process.role import STOP_LOOKS, StopSignal, run_role
 
 
 class Away(MemoryBus):
@@ -60,14 +60,25 @@ def test_any_other_error_ends_it_closed():
     assert (role.taken, role.closed) == (10, True)
 
 
-def test_says_its_metrics_and_hears_the_stop():
+def test_says_its_metrics_and_hears_the_stop(monkeypatch):
+    monkeypatch.setattr("rmc.common.process.role.STOP_PERIOD", 0.0)
     asked, bus, stop = MemoryBus(), MemoryBus(), StopSignal()
     asked.request_stop("enough")
     role = Counting(stop, 45)
     run_role(role, asked, stop)
-    assert (role.taken, role.closed) == (0, True)
+    assert (role.taken, role.closed) == (STOP_LOOKS - 1, True)
     run_role(role, bus, stop, lambda: role.taken >= 5)
     assert bus.records({"counting": "0"})[0][-1].keys() >= {"taken", "busy_share", "waiting_share", "waiting_for"}
+
+
+def test_a_stop_that_a_launcher_takes_back_ends_nothing(monkeypatch):
+    """As that of an earlier start, in a Redis that was restored to it."""
+    monkeypatch.setattr("rmc.common.process.role.STOP_PERIOD", 0.0)
+    stop, looks = StopSignal(), iter([*["enough"] * (STOP_LOOKS - 1), None] * 10)
+    bus, role = MemoryBus(), Counting(stop, 30)
+    monkeypatch.setattr(bus, "stop_requested", lambda: next(looks))
+    run_role(role, bus, stop)
+    assert role.taken == 30
 
 
 def test_sigterm_is_no_end_in_order_and_ctrl_c_is():

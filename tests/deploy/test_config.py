@@ -138,6 +138,11 @@ def test_values_that_do_not_go_together_are_refused() -> None:
         with pytest.raises(ConfigError, match=f"--burn-in=40: --state-strategy {strategy} has no burn-in"):
             validate_new(burnt)
         validate(burnt)  # a run that has it goes on
+    farther = with_value(config, "update.n_step", 16)
+    with pytest.raises(ConfigError, match=r"--n-step=16: .* at most --trained-steps=15"):
+        validate_new(farther)
+    validate(farther)
+    validate_new(with_value(farther, "window.trained_steps", 16))
     flagged = with_value(with_value(config, "agent.missing_flag", True), "agent.head_input", "observation")
     for idle, name in ((flagged, "missing-flag"), (with_value(config, "env.flicker_burst", 5.0), "flicker-burst")):
         with pytest.raises(ConfigError, match=f"--{name}=.*; (leave it|give --flicker)"):

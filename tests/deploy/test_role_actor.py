@@ -2,6 +2,7 @@
 
 import errno
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -78,7 +79,7 @@ def host(program: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iter
     actor = RoleActor(Task("test-run", RoleCommand("replay", ("replay",)), {}, {}, str(tmp_path)))
     yield actor
     actor.close()
-    actor.clear()
+    shutil.rmtree(actor.scratch)
 
 
 @pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
@@ -103,7 +104,7 @@ def test_a_role_that_is_replaced_has_its_secrets_again(program: Path, tmp_path: 
     actor.restart()
     assert (actor.scratch / "secret").read_text() == "of the run"
     actor.close()
-    actor.clear()
+    shutil.rmtree(actor.scratch)
 
 
 HOST = """
@@ -189,7 +190,7 @@ def test_a_learner_that_saves_for_long_is_not_killed(
     host = Learner(Task("test-run", RoleCommand("learner", ("learner",)), {}, {}, str(tmp_path)))
     wait_until(log.exists)
     host.close()
-    host.clear()
+    shutil.rmtree(host.scratch)
     assert log.read_text() == "ready\nsaved\n"
 
 
@@ -251,7 +252,7 @@ def test_an_end_in_order_that_nobody_asked_for_is_a_death(
     host = RoleActor(Task("test-run", RoleCommand("actor-0", ("actor",)), {}, {}, str(tmp_path)))
     wait_until(lambda: ends)
     assert host.report("", 0).status == 1
-    host.clear()
+    shutil.rmtree(host.scratch)
 
 
 def test_what_a_launcher_leaves_is_ended_but_no_other_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -286,7 +287,10 @@ def test_what_a_launcher_leaves_is_ended_but_no_other_runs(monkeypatch: pytest.M
     assert done == ["kill launcher"]  # it would hold the run's name
 
 
-def test_a_head_without_room_is_waited_for_unless_the_run_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS])
+def test_a_head_that_takes_no_file_is_waited_for_unless_the_run_is_ended(
+    number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     learner = LearnerActor.__new__(LearnerActor)
     learner._run_ends = learner._replaced = False
     tries: list[float] = []
@@ -294,7 +298,7 @@ def test_a_head_without_room_is_waited_for_unless_the_run_is_ended(monkeypatch: 
     def tend() -> None:
         tries.append(time.monotonic())
         if len(tries) < 6:
-            raise OSError(28, os.strerror(28))
+            raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(learner, "tend", tend)
     monkeypatch.setattr(learner_actor, "LOOK_SECONDS", 0.1)

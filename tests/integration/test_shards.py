@@ -4,13 +4,14 @@ import dataclasses
 import json
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
 from scipy import stats
 
 from rmc.common.bus.memory_bus import MemoryBus
-from rmc.common.replay import SampleStatus
+from rmc.common.replay import EMPTY_SAMPLE, Sample, SampleStatus
 from rmc.common.shard import Shard
 from rmc.common.window import WindowSpec
 from rmc.deploy.run.folder import RunFolder
@@ -118,6 +119,27 @@ def test_statistics_and_counters_are_those_of_one_server(wholes: list[Whole]) ->
     for other in (two, four):
         np.testing.assert_allclose(other.total, one.total)
         np.testing.assert_allclose(other.total_square, one.total_square)
+
+
+class Away:
+    """A shard that hangs: whoever asks it waits until its time is out."""
+
+    asked = 0
+
+    def sample(self, *_: object) -> Sample:
+        self.asked += 1
+        return EMPTY_SAMPLE
+
+    def statistics(self) -> None:
+        self.asked += 1
+
+
+def test_of_several_shards_that_hang_one_is_asked() -> None:
+    shards = [Away() for _ in range(3)]
+    replay = ShardedReplay(cast(Any, shards), SPEC, BATCH, seed=1)
+    assert replay.sample(BATCH).status is SampleStatus.WAIT
+    assert replay.statistics() is None
+    assert [shard.asked for shard in shards] == [2, 0, 0]
 
 
 def test_windows_by_number_with_what_critics_see_are_drawn_and_counted_alike(tmp_path: Path) -> None:

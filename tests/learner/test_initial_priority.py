@@ -54,6 +54,13 @@ def test_critics_are_broadcast_only_where_they_are_needed() -> None:
     assert {"log_alpha"} | {name for name in names[1] if name.startswith("critic.")} == names[1] - names[0]
 
 
+def test_weights_without_critics_are_refused() -> None:
+    config = AgentConfig(hidden=SPEC.state, heads=(5, 5))
+    agent = Agent(SPEC.obs_dim, SPEC.action_dim, config)
+    with pytest.raises(MessageError, match="without critics"):
+        InitialPriority(SPEC, config, UpdateConfig()).load(safetensors.torch.save(agent.broadcast_weights()))
+
+
 def test_weights_never_execute_code(tmp_path: Path) -> None:
     priority_fn = InitialPriority(SPEC, AgentConfig(hidden=SPEC.state, heads=(5, 5)), UpdateConfig())
     with pytest.raises(MessageError, match="not of this run"):

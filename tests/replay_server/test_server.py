@@ -199,14 +199,15 @@ def deviation(sums: ObservationStatistics) -> list[float]:
     return np.sqrt(sums.total_square / sums.count - mean**2).tolist()
 
 
-def test_one_huge_number_does_not_blind_the_statistics() -> None:
-    """Nor does a number that was constant for long stay one."""
+@pytest.mark.parametrize("spoilt", [1, 8])
+def test_one_huge_number_does_not_blind_the_statistics(spoilt: int) -> None:
+    """Early or late. Nor does a number that was constant for long stay one."""
     rng, sums = np.random.default_rng(5), ObservationStatistics.none(SPEC)
     for part in range(12):
         rows = make_rows(100)
         rows["observation"] = rng.normal(size=rows["observation"].shape)
         rows["observation"][..., 1] *= 1e3 if part >= 6 else 0.0
-        rows["observation"][50, -1, 0] = 1e8 if part == 8 else 0.0
+        rows["observation"][50, -1, 0] = 1e8 if part == spoilt else 0.0
         sums += observation_sums(rows, SPEC, sums)
     assert deviation(sums)[0] < 2.5  # of 4 800, that one counts as 100 of its deviations
     assert 500.0 < deviation(sums)[1] < 1e3 * 0.5**0.5  # its first part counts as too small
