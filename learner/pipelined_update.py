@@ -51,7 +51,9 @@ class Slot:
         z, next_z, curiosity, hidden = (
             _cut(place, batch.cut) for place in (whole.z, whole.next_z, whole.curiosity, whole.hidden)
         )
-        return whole._replace(z=z, next_z=next_z, curiosity=curiosity, hidden=hidden)
+        untrained = set() if batch.plan.trains_imputer else {"fill_loss"}  # whose place has an earlier batch's
+        metrics = {name: value for name, value in whole.metrics.items() if name not in untrained}
+        return whole._replace(z=z, next_z=next_z, curiosity=curiosity, hidden=hidden, metrics=metrics)
 
     def write(self, batch: Batch, model: ModelPass, norm: Tensor) -> None:
         """Put the model's half of that batch in."""
@@ -162,7 +164,6 @@ class PipelinedUpdate:
                 *update.average.tensors(MODEL_PARTS),
                 *update.agent.normalizer.buffers(),
                 update.curiosity_variance,
-                update.fill_loss,
             ]
         )
         self._slots = [self._make_slot() for _ in range(AHEAD + 1)]

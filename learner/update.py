@@ -31,7 +31,7 @@ from rmc.learner.unroll import impute_and_unroll, unroll
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
 MODEL_PARTS = ("memory", "world_model", "next_frame")
 ACTOR_CRITIC_PARTS = ("critic", "policy", "log_alpha")
-IMPUTER_UPDATES = 8  # for one of the imputer's, until a frame is missing: before that its output is unused
+IMPUTER_UPDATES = 10  # for one of the imputer's, until a frame is missing: before that its output is unused
 TRAINS_MEMORY = {  # the paper's table 1
     1: {"model", "value"},
     2: {"value"},
@@ -49,7 +49,6 @@ class ModelPass(NamedTuple):
     next_z: Tensor  # (B, L_t, Z), what the target reads, without gradient
     curiosity: Tensor  # (B, L_t), scaled where configured
     curiosity_variance: Tensor  # (2,), as it is after this batch
-    fill_loss: Tensor  # scalar, the imputer's last
     hidden: Tensor  # (B, L_t + 1, H), for the latent's rank
     observation_unexplained: Tensor  # (O,), see ``diagnostics.unexplained_change``; (0,) without grounding
     metrics: dict[str, Tensor]  # scalars
@@ -91,8 +90,6 @@ class JointUpdate:
         self.generator = torch.Generator(device).manual_seed(seed)
         self.curiosity_variance = torch.zeros(2, device=device)  # running mean, and the weight it has gathered
         self.was_missing = torch.zeros((), dtype=torch.bool)  # whether a frame ever was, on the host
-        self.fill_loss = torch.zeros((), device=device)  # the imputer's last
-        self.policy_loss = torch.zeros((), device=device)  # the policy's last
 
     def _make_optimizers(self) -> list[torch.optim.Adam]:
         return [make_adam(self.agent, self.config, *parts) for parts in (MODEL_PARTS, ACTOR_CRITIC_PARTS)]
@@ -102,7 +99,7 @@ class JointUpdate:
         loss_values, model, actor_critic = self.forward(batch, beta)
         norm = self.step(self.optimizers, loss_values.values())
         self.after_model_step(model)
-        self.after_actor_critic_step(actor_critic)
+        self.after_actor_critic_step()
         return self.result(batch, model, actor_critic, norm)
 
     def train_model(self, batch: Batch) -> tuple[ModelPass, Tensor]:
@@ -116,7 +113,7 @@ class JointUpdate:
         """The other half, which moves critics, policy and temperature alone, and its gradient's norm."""
         loss_values, actor_critic = self.actor_critic_pass(batch, model, beta)
         norm = self.step(self.optimizers[1:], loss_values.values())
-        self.after_actor_critic_step(actor_critic)
+        self.after_actor_critic_step()
         return actor_critic, norm
 
     def forward(self, batch: Batch, beta: Tensor) -> tuple[Losses, ModelPass, ActorCriticPass]:
@@ -149,17 +146,14 @@ class JointUpdate:
             error = losses.model_error(prediction.hidden_change.float(), change, c.model_norm)
             i, curiosity_variance = self._scaled(losses.curiosity(error, d, m), m)
         o = o[:, batch.trained]
-        imputer_losses = self._imputer_losses(o, remembered, batch, m)
+        imputer_loss = self._imputer_loss(o, remembered, batch, m)
         grounding_loss, unexplained = self._grounding_loss(o, prediction, batch, m)
-        loss_values = {"model_loss": losses.model_loss(error, d, m)} | imputer_losses | grounding_loss
+        loss_values = {"model_loss": losses.model_loss(error, d, m)} | imputer_loss | grounding_loss
 
         # What is reported: nothing is learnt from it
         metrics = model_metrics(detached(loss_values), change, i, d, m, c.model_norm)
-        fill_loss = detached(imputer_losses).get("fill_loss", self.fill_loss)
-        if agent.next_frame is not None:
-            metrics["fill_loss"] = fill_loss
         hidden = remembered.hidden.detach()
-        return loss_values, ModelPass(z, next_z, i, curiosity_variance, fill_loss, hidden, unexplained, metrics)
+        return loss_values, ModelPass(z, next_z, i, curiosity_variance, hidden, unexplained, metrics)
 
     def actor_critic_pass(self, batch: Batch, model: ModelPass, beta: Tensor) -> tuple[Losses, ActorCriticPass]:
         """Intuition: one policy sample for every step serves both the target and the policy loss."""
@@ -194,9 +188,8 @@ class JointUpdate:
             loss_values["policy_loss"] = losses.policy_loss(log_pi, self._frozen_q(*proposed), alpha, m)
 
         # What is reported: nothing is learnt from it
-        reported = {"policy_loss": self.policy_loss.clone()} | detached(loss_values)
         metrics = actor_critic_metrics(
-            reported, alpha, log_pi.detach(), q.detach(), td_error, model.curiosity, r, m, beta
+            detached(loss_values), alpha, log_pi.detach(), q.detach(), td_error, model.curiosity, r, m, beta
         )
         return loss_values, ActorCriticPass(losses.priority(td_error, c.eta, m), metrics)
 
@@ -241,9 +234,9 @@ class JointUpdate:
             return Plan(steps, False, False, trains_policy)
         imputes = has_missing(raw, spec)
         self.was_missing |= imputes
-        return Plan(steps, imputes, bool(self.was_missing) or number % IMPUTER_UPDATES == 1, trains_policy)
+        return Plan(steps, imputes, bool(self.was_missing) or number % IMPUTER_UPDATES == 0, trains_policy)
 
-    def _imputer_losses(self, o: Tensor, remembered: MemoryOutput, batch: Batch, m: Tensor) -> Losses:
+    def _imputer_loss(self, o: Tensor, remembered: MemoryOutput, batch: Batch, m: Tensor) -> Losses:
         """The imputer's, where it is configured and its turn; o (B, L_t + 1, O)."""
         imputer, now, after = self.agent.next_frame, o[:, :-1], o[:, 1:]
         if imputer is None or not batch.plan.trains_imputer:
@@ -303,15 +296,13 @@ class JointUpdate:
         return norm.detach()
 
     def after_model_step(self, model: ModelPass) -> None:
-        """What follows the memory's step: its target by Polyak, the running variance, the imputer's last loss."""
+        """What follows the memory's step: its target by Polyak, the running variance."""
         if self.ema_memory is not None:
             polyak_update(self.ema_memory, self.agent.memory, 1.0 - self.config.polyak)
         self.curiosity_variance.copy_(model.curiosity_variance)
-        self.fill_loss.copy_(model.fill_loss)
 
-    def after_actor_critic_step(self, actor_critic: ActorCriticPass) -> None:
-        """What follows the critics' step: their targets by Polyak, the policy's last loss."""
-        self.policy_loss.copy_(actor_critic.metrics["policy_loss"])
+    def after_actor_critic_step(self) -> None:
+        """What follows the critics' step: their targets by Polyak."""
         if self.target_critic is not None:
             polyak_update(self.target_critic, self.agent.critic, 1.0 - self.config.polyak)
 
@@ -325,8 +316,6 @@ class JointUpdate:
             "optimizers": [optimizer.state_dict() for optimizer in self.optimizers],
             "curiosity_variance": self.curiosity_variance,
             "was_missing": self.was_missing,
-            "fill_loss": self.fill_loss,
-            "policy_loss": self.policy_loss,
             "generator": self.generator.get_state(),
         }
 
@@ -344,8 +333,7 @@ class JointUpdate:
             for group, ours in zip(optimizer.param_groups, own, strict=True):
                 group.update(ours)  # of this config and this device, whatever wrote the checkpoint
         self.curiosity_variance.copy_(state["curiosity_variance"])
-        for name in ("was_missing", "fill_loss", "policy_loss"):  # which checkpoints of older versions have not
-            getattr(self, name).copy_(state.get(name, getattr(self, name)))
+        self.was_missing.copy_(state.get("was_missing", self.was_missing))  # older checkpoints have none
         self._resume_noise(state["generator"].cpu())
 
     def _resume_noise(self, state: Tensor) -> None:

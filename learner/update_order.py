@@ -49,7 +49,7 @@ class AlternateUpdate(JointUpdate):
         model, actor_critic = of_critics
         actor_critic = actor_critic._replace(metrics=actor_critic.metrics | metrics)
         self.after_model_step(model)
-        self.after_actor_critic_step(actor_critic)
+        self.after_actor_critic_step()
         return self.result(batch, model, actor_critic, torch.stack(norms).norm())
 
 

@@ -12,8 +12,9 @@ from rmc.common.agent_config import AgentConfig
 from rmc.learner import losses
 from rmc.learner.batch import clear_padding, longest_steps, view_batch
 from rmc.learner.config import UpdateConfig
+from rmc.learner.learner_metrics import METRICS_UPDATES
 from rmc.learner.unroll import unroll
-from rmc.learner.update import TRAINS_MEMORY, JointUpdate, UpdateResult
+from rmc.learner.update import IMPUTER_UPDATES, TRAINS_MEMORY, JointUpdate, UpdateResult
 from rmc.learner.update_order import make_update
 from tests.learner.agents import PAPER, ROBUST
 from tests.learner.rows import SPEC, observation_valid, random_rows, spoil_padding, to_batch
@@ -279,26 +280,25 @@ def moves_of_the_imputer(update: JointUpdate, updates: int, missing_from: int, b
 
 def test_what_imputes_is_trained_seldom_until_a_frame_is_missing():
     update = make(IMPUTING)
-    assert moves_of_the_imputer(update, 30, missing_from=20) == [1, 9, 17, *range(20, 31)]
+    assert moves_of_the_imputer(update, 30, missing_from=25) == [10, 20, *range(25, 31)]
     in_turn = make(IMPUTING, update_order="alternate")
-    assert moves_of_the_imputer(in_turn, 14, missing_from=11) == [1, 9, 11, 12, 13, 14]
+    assert moves_of_the_imputer(in_turn, 14, missing_from=12) == [10, 12, 13, 14]
+    assert METRICS_UPDATES % IMPUTER_UPDATES == 0  # what is looked at has its loss
 
 
-def test_its_turns_go_on_from_a_checkpoint_and_it_says_its_last_loss():
+def test_its_turns_go_on_from_a_checkpoint():
     before, after = make(IMPUTING), make(IMPUTING)
-    assert moves_of_the_imputer(before, 5, missing_from=99) == [1]
-    state = before.state_dict()
-    loss = state["fill_loss"].item()
-    after.load_state_dict(state)
-    assert update_of(after, 6, False).metrics["fill_loss"] == loss > 0
-    assert moves_of_the_imputer(after, 4, missing_from=8, begin=7) == [8, 9, 10]
+    assert moves_of_the_imputer(before, 5, missing_from=99) == []
+    after.load_state_dict(before.state_dict())
+    assert moves_of_the_imputer(after, 4, missing_from=8, begin=6) == [8, 9]
     after.load_state_dict(after.state_dict())
     assert moves_of_the_imputer(after, 2, missing_from=99, begin=11) == [11, 12]
+    assert update_of(after, 13, False).metrics["fill_loss"] > 0
 
 
 def test_an_older_checkpoint_says_nothing_of_missing_frames():
     update = make(IMPUTING)
-    older = {name: value for name, value in update.state_dict().items() if name not in ("was_missing", "fill_loss")}
+    older = {name: value for name, value in update.state_dict().items() if name != "was_missing"}
     update.load_state_dict(older)
     assert moves_of_the_imputer(update, 2, missing_from=99, begin=2) == []
 
@@ -316,10 +316,8 @@ def test_the_policy_waits_for_its_turn_and_nothing_else_does(order):
         assert plan.trains_policy == (part(update, "policy.") <= moved)
         assert moved >= part(update, "memory.", "critic.", "world_model.", "log_alpha")
         moves += [number] if part(update, "policy.") & moved else []
-        said.append(updated.metrics["policy_loss"].item())
-    assert moves == [3, 6]
-    assert said[:2] == [0.0, 0.0]  # there was none yet
-    assert said[2] == said[3] == said[4] != said[5]
+        said += [number] if "policy_loss" in updated.metrics else []
+    assert moves == said == [3, 6]
 
 
 def test_a_runs_first_update_is_of_whole_windows_so_that_too_large_ones_end_at_once() -> None:
