@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from rmc.common.agent import Agent, squashed_sample
-from rmc.common.agent_config import CRITIC_PARTS, AgentConfig
+from rmc.common.agent_config import AgentConfig
 from rmc.common.critic import critic_input
 from rmc.common.errors import MessageError
 from rmc.common.window import Rows, WindowSpec
@@ -37,11 +37,16 @@ class InitialPriority:
     def load(self, blob: bytes) -> None:
         """Take over what was broadcast, the safetensors of ``Agent.broadcast_weights()``. Raises MessageError."""
         try:
-            lacking = self._agent.load_state_dict(safetensors.torch.load(blob), strict=False).missing_keys
-        except (safetensors.SafetensorError, RuntimeError) as error:
+            weights = safetensors.torch.load(blob)
+        except safetensors.SafetensorError as error:
             raise MessageError("weights", f"not of this run ({error})") from None
-        if critics := [name for name in lacking if name.startswith(CRITIC_PARTS)]:
-            raise MessageError("weights", f"without critics ({critics[0]})")
+        mine = self._agent.broadcast_weights()
+        for name in [*mine, *weights]:  # before any is taken, so that what is refused changes nothing
+            if name not in mine or name not in weights or weights[name].shape != mine[name].shape:
+                raise MessageError("weights", f"not of this run ({name})")
+            if not weights[name].isfinite().all():
+                raise MessageError("weights", f"{name} is not finite")
+        self._agent.load_state_dict(weights, strict=False)
 
     @torch.no_grad()
     def __call__(self, rows: Rows) -> NDArray[np.float32]:

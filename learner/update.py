@@ -225,7 +225,7 @@ class JointUpdate:
     def plan(self, raw: Tensor, spec: WindowSpec, number: int) -> Plan:
         """Of update ``number``, from its (B, row bytes) on the host.
 
-        A run's first is of whole windows, so that one too large for the machine ends at once.
+        A run's first is of whole windows, so that one too large for the machine ends early.
         The imputer trains at every ``IMPUTER_UPDATES``-th until a frame was missing, then at every one.
         """
         steps = spec.steps if number == 1 else longest_steps(raw, spec)

@@ -87,7 +87,8 @@ class LearnerActor(RoleActor):
             try:
                 self.tend()
                 return
-            except AWAY:
-                if not (self._run_ends or self._replaced):  # the head is waited for: it may lack room, or be away
+            except AWAY as error:
+                damaged = isinstance(error, CheckpointError)  # here: the head's own errors are Ray's
+                if not (damaged or self._run_ends or self._replaced):  # the head may lack room, or be away
                     deadline = time.monotonic() + SETTLE_SECONDS
                 time.sleep(LOOK_SECONDS)

@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
 
@@ -26,13 +27,14 @@ from rmc.common.bus.protocol import Ack, Bus, Entry, EntryId, ReplayOwner, Versi
 from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.make import make_env
-from rmc.common.errors import BusFull, BusUnavailable, EnvFault, FencedError
+from rmc.common.errors import BusFull, BusUnavailable, EnvFault, FencedError, MessageError
 from rmc.common.window import Rows, WindowSpec, joined
 from rmc.common.wire import decode_rows
 from tests.broken_env import BREAKS_AT, FAULTS
 from tests.counting_env import ACTION_DIM, OBS_DIM, CountingEnv, Step, audit
 from tests.habits import Dead
 from tests.learner.rows import step_valid
+from tests.raising import raising
 
 AGENT = AgentConfig(hidden=8, embedding=8, heads=(8, 8))
 SPEC = WindowSpec(OBS_DIM, ACTION_DIM, AGENT.hidden, burn_in=4, train=6)
@@ -230,6 +232,17 @@ def test_a_policy_that_cannot_be_read_is_refused_and_the_one_before_goes_on(bus:
     assert record["env_steps"] == 800
     assert record["weights_update"] == 3
     assert record["refused_weights"] == 2
+
+
+def test_a_policy_whose_critics_are_refused_does_not_act(bus: Bus) -> None:
+    refusing = SimpleNamespace(load=raising(MessageError("weights", "without critics")), reseed=lambda _: None)
+    publish(bus, 7)
+    actor = make_actor(bus)
+    actor._priority_fn = refusing
+    loaded: list[bytes] = []
+    actor._runner.load = loaded.append
+    assert not actor.step()
+    assert (actor.metrics()["refused_weights"], loaded) == (1, [])
 
 
 def test_metrics() -> None:

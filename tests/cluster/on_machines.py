@@ -271,11 +271,11 @@ def test_a_run_learns_is_stopped_and_goes_on(site: Site) -> None:
 
 
 def test_a_run_that_is_over_leaves_nothing_also_where_its_roles_have_been_before(site: Site) -> None:
-    run, found, machines = Run(site, "over", "--preset", "debug", "--total-steps", "3000"), "", site.machines.machines
-    while not found:
-        assert run.process.poll() is None, run.text()
-        places = [machine.run("ls -d /tmp/rmc-ray-0-*", check=False).stdout.strip() for machine in machines]
-        found = next(filter(None, places), "")
+    run, machines = Run(site, "over", "--preset", "debug", "--total-steps", "3000"), site.machines.machines
+    run.wait_for(lambda: run.newest("learner", "updates"))
+    identity = site.head.run(f"cat {run.folder}/scratch").stdout.split()[-1]
+    found = f"/tmp/rmc-ray-0-{identity}"
+    assert any(machine.run(f"ls {found}", check=False).stdout for machine in machines)
     for machine in machines:
         machine.run(f"mkdir -p -m 700 {found}")
     output, _ = run.process.communicate(timeout=180)

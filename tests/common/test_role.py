@@ -73,10 +73,10 @@ def test_says_its_metrics_and_hears_the_stop(monkeypatch):
 
 def test_a_stop_that_a_launcher_takes_back_ends_nothing(monkeypatch):
     """As that of an earlier start, in a Redis that was restored to it."""
-    monkeypatch.setattr("rmc.common.process.role.STOP_PERIOD", 0.0)
-    stop, looks = StopSignal(), iter([*["enough"] * (STOP_LOOKS - 1), None] * 10)
+    stop, looks = StopSignal(), iter([*["enough"] * (STOP_LOOKS - 1), None] * 30)
     bus, role = MemoryBus(), Counting(stop, 30)
     monkeypatch.setattr(bus, "stop_requested", lambda: next(looks))
+    monkeypatch.setattr("rmc.common.process.role.STOP_PERIOD", 0.0)
     run_role(role, bus, stop)
     assert role.taken == 30
 

@@ -143,6 +143,7 @@ def test_values_that_do_not_go_together_are_refused() -> None:
         validate_new(farther)
     validate(farther)
     validate_new(with_value(farther, "window.trained_steps", 16))
+    validate_new(with_value(farther, "actor.state_strategy", "episode"))
     flagged = with_value(with_value(config, "agent.missing_flag", True), "agent.head_input", "observation")
     for idle, name in ((flagged, "missing-flag"), (with_value(config, "env.flicker_burst", 5.0), "flicker-burst")):
         with pytest.raises(ConfigError, match=f"--{name}=.*; (leave it|give --flicker)"):

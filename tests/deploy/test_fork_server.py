@@ -155,7 +155,7 @@ def test_one_that_hangs_is_given_up_for_another(
 def test_a_system_without_room_for_a_process_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fork_server.os, "fork", raising(OSError(errno.EAGAIN, os.strerror(errno.EAGAIN))))
     ours, theirs = socket.socketpair()
-    with ours, theirs, (tmp_path / "log").open("ab") as log:
+    with ours, theirs, open("/dev/full", "ab") as log:
         assert fork_server._forked(theirs, {"words": [], "environment": {}}, log.fileno()) == 0
     refusing = ForkServer(tmp_path / "fork_server.log")
     monkeypatch.setattr(refusing, "start", lambda: None)

@@ -16,7 +16,7 @@ from rmc.common.bus.redis_bus import RedisBus
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import BusUnavailable, ConfigError
-from rmc.common.process.role import StopSignal
+from rmc.common.process.role import STOP_LOOKS, STOP_PERIOD, StopSignal
 from rmc.common.replay import ObservationStatistics
 from rmc.deploy.local import launcher
 from rmc.deploy.local.role_context import RoleContext
@@ -33,6 +33,7 @@ from tests.raising import raising
 from tests.replay_server.support import SPEC
 
 CONFIG = debug(EnvConfig("Pendulum-v1"))
+USUAL_LOOK_SECONDS = registration.LOOK_SECONDS
 COUNTED = Progress(ObservationStatistics.none(SPEC), env_steps=7).publish()
 
 
@@ -59,7 +60,8 @@ def test_a_redis_that_forgot_is_told_again_what_it_must_know(tmp_path: Path, red
 def test_a_redis_that_came_back_with_what_it_knew_before_is_told_again(
     tmp_path: Path, redis_url: str, run_name: str
 ) -> None:
-    """As one that is restored from a snapshot of before the run went on."""
+    """As one that is restored from a snapshot of before the run went on: sooner than a role believes in its stop."""
+    assert USUAL_LOOK_SECONDS + launcher.TICK_SECONDS < (STOP_LOOKS - 1) * STOP_PERIOD
     bus = RedisBus(redis_url, run_name)
     registered = Registration(CONFIG, RunFolder(tmp_path), bus)
     bus.set_config(to_registration(dataclasses.replace(CONFIG, actors=7)))

@@ -287,9 +287,13 @@ def test_what_a_launcher_leaves_is_ended_but_no_other_runs(monkeypatch: pytest.M
     assert done == ["kill launcher"]  # it would hold the run's name
 
 
-@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS])
+NO_ROOM, READ_ONLY = (OSError(number, os.strerror(number)) for number in (errno.ENOSPC, errno.EROFS))
+NO_LAUNCHER, AWAY = ValueError("no such actor"), launcher_actor.ray.exceptions.RayActorError()
+
+
+@pytest.mark.parametrize("error", [NO_ROOM, READ_ONLY, NO_LAUNCHER, AWAY])
 def test_a_head_that_takes_no_file_is_waited_for_unless_the_run_is_ended(
-    number: int, monkeypatch: pytest.MonkeyPatch
+    error: Exception, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     learner = LearnerActor.__new__(LearnerActor)
     learner._run_ends = learner._replaced = False
@@ -298,7 +302,7 @@ def test_a_head_that_takes_no_file_is_waited_for_unless_the_run_is_ended(
     def tend() -> None:
         tries.append(time.monotonic())
         if len(tries) < 6:
-            raise OSError(number, os.strerror(number))
+            raise error
 
     monkeypatch.setattr(learner, "tend", tend)
     monkeypatch.setattr(learner_actor, "LOOK_SECONDS", 0.1)
@@ -309,3 +313,14 @@ def test_a_head_that_takes_no_file_is_waited_for_unless_the_run_is_ended(
     learner._run_ends = True
     learner.flush_artifacts()
     assert len(tries) < 4
+
+
+def test_a_last_checkpoint_that_is_damaged_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    learner = LearnerActor.__new__(LearnerActor)
+    learner._run_ends = learner._replaced = False
+    monkeypatch.setattr(learner, "tend", raising(CheckpointError("does not match its manifest")))
+    monkeypatch.setattr(learner_actor, "LOOK_SECONDS", 0.05)
+    monkeypatch.setattr(learner_actor, "SETTLE_SECONDS", 0.15)
+    began = time.monotonic()
+    learner.flush_artifacts()
+    assert time.monotonic() - began < 5.0

@@ -1,6 +1,7 @@
 """What an actor thinks a window is worth is what the learner would, with the same networks and noise."""
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -54,11 +55,28 @@ def test_critics_are_broadcast_only_where_they_are_needed() -> None:
     assert {"log_alpha"} | {name for name in names[1] if name.startswith("critic.")} == names[1] - names[0]
 
 
-def test_weights_without_critics_are_refused() -> None:
-    config = AgentConfig(hidden=SPEC.state, heads=(5, 5))
-    agent = Agent(SPEC.obs_dim, SPEC.action_dim, config)
-    with pytest.raises(MessageError, match="without critics"):
-        InitialPriority(SPEC, config, UpdateConfig()).load(safetensors.torch.save(agent.broadcast_weights()))
+SPOILT = {
+    "no critics": lambda weights: {name: value for name, value in weights.items() if "critic" not in name},
+    "no policy": lambda weights: {name: value for name, value in weights.items() if "policy" not in name},
+    "another's": lambda weights: weights | {"other": torch.zeros(1)},
+    "another shape": lambda weights: weights | {"log_alpha": torch.zeros(2)},
+    "not finite": lambda weights: weights | {"log_alpha": torch.tensor(float("nan"))},
+}
+
+
+@pytest.mark.parametrize("spoilt", SPOILT.values(), ids=SPOILT)
+def test_refused_weights_change_nothing(spoilt: Callable[[dict[str, torch.Tensor]], dict[str, torch.Tensor]]) -> None:
+    config = AgentConfig(hidden=SPEC.state, heads=(5, 5), initial_priority="actor")
+    torch.manual_seed(0)
+    first, second = (Agent(SPEC.obs_dim, SPEC.action_dim, config).broadcast_weights() for _ in range(2))
+    priority_fn, rows = InitialPriority(SPEC, config, UpdateConfig()), random_rows(6)
+    priority_fn.load(safetensors.torch.save(first))
+    priority_fn.reseed(3)
+    before = priority_fn(rows)
+    with pytest.raises(MessageError, match=r"^weights"):
+        priority_fn.load(safetensors.torch.save(spoilt(second)))
+    priority_fn.reseed(3)
+    np.testing.assert_array_equal(priority_fn(rows), before)
 
 
 def test_weights_never_execute_code(tmp_path: Path) -> None:
