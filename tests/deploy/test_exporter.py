@@ -109,9 +109,9 @@ def documented(what: str) -> set[str]:
     return {name for row in table.splitlines() for name in re.findall(r"`(\w+)`", row.split("|")[1])}
 
 
-def test_every_alert_is_documented() -> None:
+def test_every_alert_is_tried() -> None:
     (group,) = yaml.safe_load(ALERTS.read_text())["groups"]
-    assert {rule["alert"] for rule in group["rules"]} == documented("alert") == {alert for alert, *_ in CASES}
+    assert {rule["alert"] for rule in group["rules"]} == {alert for alert, *_ in CASES}
 
 
 def test_strangers_take_few_handles_and_the_end_waits_for_none(
