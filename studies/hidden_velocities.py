@@ -7,6 +7,7 @@ STUDY = Study(
     "hidden_velocities",
     {
         "RMC": "train ENV --hide velocities",
+        "RMC, slow memory": "train ENV --hide velocities --memory-learning-scale 0.3",
         "SAC, 4 frames": "baseline sac ENV --hide velocities --frame-stack 4",
         "RecurrentPPO": "baseline recurrent-ppo ENV --hide velocities",
     },

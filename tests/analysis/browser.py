@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -76,10 +77,12 @@ def opened(url: str, folder: Path) -> Iterator[Page]:
     try:
         yield Page(to, back, url)
     finally:
+        its_own = psutil.Process(process.pid).children(recursive=True)
         os.close(to), os.close(back)  # then it ends
         try:
             process.wait(END_SECONDS)
         finally:
             process.kill()
             process.wait()
+            psutil.wait_procs(its_own, END_SECONDS)
     assert "Uncaught" not in log.read_text(errors="replace"), log.read_text(errors="replace")
