@@ -42,9 +42,10 @@ class InitialPriority:
             raise MessageError("weights", f"not of this run ({error})") from None
         mine = self._agent.broadcast_weights()
         for name in [*mine, *weights]:  # before any is taken, so that what is refused changes nothing
-            if name not in mine or name not in weights or weights[name].shape != mine[name].shape:
+            given, own = weights.get(name), mine.get(name)
+            if given is None or own is None or (given.shape, given.dtype) != (own.shape, own.dtype):
                 raise MessageError("weights", f"not of this run ({name})")
-            if not weights[name].isfinite().all():
+            if not given.isfinite().all():
                 raise MessageError("weights", f"{name} is not finite")
         self._agent.load_state_dict(weights, strict=False)
 

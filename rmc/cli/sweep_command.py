@@ -191,13 +191,13 @@ def _count(number: int, what: str) -> str:
 
 def _warn_of_empty_rings(todo: list[Job]) -> None:
     begun = [job for job in todo if (job.folder / "checkpoints" / "epoch").exists()]
-    empty = [job.name for job in begun if not RunFolder(job.folder).rings() and not _is_trained(job)]
+    empty = [job.name for job in begun if not RunFolder(job.folder).rings() and not _has_all_steps(job)]
     if empty:
         names = ", ".join(empty)
         log.warning("without their replay ring, these continue with --warmup-steps that are not trained on: %s", names)
 
 
-def _is_trained(job: Job) -> bool:
+def _has_all_steps(job: Job) -> bool:
     """Whether only its last evaluation is to be played again."""
     result = RunFolder(job.folder).result()
     return result is not None and result["env_steps"] >= sweep_check.read_job(job)[0].total_steps

@@ -60,6 +60,7 @@ SPOILT = {
     "no policy": lambda weights: {name: value for name, value in weights.items() if "policy" not in name},
     "another's": lambda weights: weights | {"other": torch.zeros(1)},
     "another shape": lambda weights: weights | {"log_alpha": torch.zeros(2)},
+    "another type": lambda weights: weights | {"log_alpha": torch.zeros((), dtype=torch.float64)},
     "not finite": lambda weights: weights | {"log_alpha": torch.tensor(float("nan"))},
 }
 
