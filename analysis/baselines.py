@@ -5,10 +5,8 @@ The run's folder looks like that of ``rmc train``, so that ``rmc plot`` reads bo
 """
 
 import dataclasses
-import json
 import shutil
 from contextlib import ExitStack, closing, suppress
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -25,11 +23,9 @@ from rmc.common.env.make import env_layout, make_env
 from rmc.common.errors import STOPPED_STATUS, ConfigError
 from rmc.common.process.role import StopSignal
 from rmc.common.return_text import return_text
-from rmc.common.whole_file import write_whole
 from rmc.deploy.run.env_sizes import layout_sizes
 from rmc.deploy.run.folder import RunFolder, read_object
 from rmc.deploy.run.launch_options import LaunchOptions
-from rmc.deploy.run.migrations import FORMAT
 from rmc.deploy.run.opening import default_name, forget_start, has_more_than_a_start, make, new_folder
 from rmc.deploy.run.option_names import changes, option
 from rmc.deploy.run.starts import note_start, resume_command
@@ -134,8 +130,7 @@ def _write_start(config: BaselineConfig, folder: RunFolder, sizes: dict[str, Any
     for leftover in set(folder.checkpoints.glob("[0-9]*")) - set(saved_states(folder)):  # by a crash amid a save
         shutil.rmtree(leftover)
     note_start(folder, changed, LaunchOptions(folder.path), None)
-    written = json.dumps({"format": FORMAT} | asdict(config), indent=2)
-    write_whole(folder.path / "config.json", f"{written}\n".encode())
+    folder.write_config(config)
     folder.write_sizes(sizes)
     folder.reopen(config.total_steps)
 

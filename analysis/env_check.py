@@ -60,7 +60,8 @@ class Played:
         self._see(*env.reset(seed=seed))
         for _ in range(steps):
             start = time.perf_counter()
-            observation, reward, terminated, truncated, info = env.step(_action(env, rng))
+            action = rng.uniform(-1.0, 1.0, env.action_space.shape).astype(np.float32)
+            observation, reward, terminated, truncated, info = env.step(action)
             self.seconds += time.perf_counter() - start
             self._see(observation, info)
             self.rewards.append(float(reward))
@@ -241,9 +242,3 @@ def _listed(chosen: BoolArray) -> str:
     numbers = np.flatnonzero(chosen).tolist()
     shown = ", ".join(map(str, numbers[:LISTED]))
     return f"{shown} and {len(numbers) - LISTED} more" if len(numbers) > LISTED else shown
-
-
-def _action(env: Env, rng: np.random.Generator) -> Any:
-    space = env.action_space
-    assert isinstance(space, gym.spaces.Box)
-    return rng.uniform(space.low, space.high).astype(np.float32)

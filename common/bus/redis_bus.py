@@ -216,7 +216,7 @@ class RedisBus(WeightStore):
             return records, cursors
         streams = {self.key("metrics", role): cursor for role, cursor in after.items()}
         reply = self.call(lambda: self.redis.xread(streams, count=RECORDS_READ))
-        for name, entries in _stream_items(reply):
+        for name, entries in reply:
             role = name.decode().removeprefix(f"{self.key('metrics')}:")
             cursors[role] = entries[-1][0].decode()
             records += [{**record, "role": role} for record in map(self._record, entries) if record is not None]
@@ -266,15 +266,6 @@ def _entry_id(raw: bytes | str) -> EntryId:
 def _entries(reply: Any) -> list[Entry]:
     return [
         Entry(int(name.rsplit(b":", 1)[1]), _entry_id(raw_id), fields.get(b"p", b""))
-        for name, entries in _stream_items(reply)
+        for name, entries in reply
         for raw_id, fields in entries
     ]
-
-
-def _stream_items(reply: Any) -> list[tuple[bytes, list[tuple[bytes, dict[bytes, bytes]]]]]:
-    """XREAD's reply as pairs, whether the protocol made it a list (RESP2) or a map (RESP3)."""
-    if not reply:
-        return []
-    if isinstance(reply, dict):
-        return [(name, chunks[0]) for name, chunks in reply.items()]
-    return list(reply)

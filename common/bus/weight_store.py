@@ -27,7 +27,7 @@ class WeightStore(RedisConnection):
         return begin, {key.encode() for head, kind in heads if head for key in self._keys_of(head[0], head[1], kind)}
 
     def publish_weights(self, version: Version, blob: bytes, evaluate: bool = False) -> None:
-        pieces = split_pieces(blob)
+        pieces = [blob[at : at + PIECE_BYTES] for at in range(0, max(len(blob), 1), PIECE_BYTES)]
         keys = self._keys_of(version, len(pieces), evaluate)
         for key, piece in zip(keys, pieces, strict=True):  # one call each: a pipeline would make them one blob again
             self.call(self.redis.set, key, piece, UNPUBLISHED_SECONDS)
@@ -90,11 +90,6 @@ class WeightStore(RedisConnection):
             return version, join_pieces(pieces, crc)
         except MessageError:
             return None
-
-
-def split_pieces(blob: bytes) -> list[bytes]:
-    """A blob as pieces of at most 256 KiB, at least one."""
-    return [blob[start : start + PIECE_BYTES] for start in range(0, max(len(blob), 1), PIECE_BYTES)]
 
 
 def join_pieces(pieces: Sequence[bytes | None], crc: int) -> bytes:

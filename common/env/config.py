@@ -84,7 +84,7 @@ def read_kwargs(words: Sequence[str]) -> dict[str, Any]:
             raise ConfigError("--env-kwargs", word, "write NAME=VALUE, like goal=1.5, and ENV before them")
         if name in kwargs:
             raise ConfigError("--env-kwargs", word, f"{name} is there twice; give it once")
-        kwargs[name] = _typed(value)
+        kwargs[name] = typed(value)
         if kwargs[name] == value and value.startswith(("[", "{")):
             raise ConfigError("--env-kwargs", word, 'no JSON; keep its quotes from the shell: \'names=["a", "b"]\'')
     check_kwargs(kwargs)
@@ -137,7 +137,8 @@ def plain(value: Any) -> Any:
     raise TypeError(f"{type(value).__name__} is not JSON's")
 
 
-def _typed(value: str) -> Any:
+def typed(value: str) -> Any:
+    """A typed word as Python's or JSON's value, else as text."""
     if value in PYTHONS:
         return PYTHONS[value]
     with suppress(ValueError, RecursionError):
@@ -153,5 +154,5 @@ def _refuse(constant: str) -> Any:
 
 def _word(value: Any) -> str:
     """Quoted where it would be read as another value, or refused."""
-    bare = isinstance(value, str) and _typed(value) == value and not value.startswith(("[", "{"))
+    bare = isinstance(value, str) and typed(value) == value and not value.startswith(("[", "{"))
     return value if bare else json.dumps(value)

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from statistics import mean
 from typing import Any
 
 from rmc.common.bus.metrics_record import is_complete, is_finite
@@ -225,9 +226,7 @@ class RunStatus:
     @property
     def episode_return(self) -> float | None:
         """Mean of the actors' newest episode returns."""
-        said = self.of_this_start().values()
-        values = [record["episode_return_mean"] for record in said if "episode_return_mean" in record]
-        return sum(values) / len(values) if values else None
+        return self.aggregate("actor-", "episode_return_mean", mean)
 
     @property
     def broken_episodes(self) -> int:

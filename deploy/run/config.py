@@ -134,8 +134,8 @@ class RunConfig:
 # JSON
 
 
-def to_json(config: RunConfig) -> str:
-    """The config as JSON, as in ``config.json``."""
+def to_json(config: Any) -> str:
+    """A run's config, or a baseline's, as JSON, as in ``config.json``."""
     return json.dumps({"format": FORMAT} | dataclasses.asdict(config), indent=2)
 
 

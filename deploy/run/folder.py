@@ -130,7 +130,7 @@ class RunFolder:
         except ConfigError as error:
             raise ConfigError("RUN", str(self.path), str(error)) from None
 
-    def write_config(self, config: RunConfig) -> None:
+    def write_config(self, config: Any) -> None:
         write_whole(self.path / "config.json", f"{to_json(config)}\n".encode())
 
     def result(self) -> dict[str, Any] | None:

@@ -13,7 +13,7 @@ from typing import Any
 
 from rmc.common.bus.metrics_record import is_finite
 from rmc.common.bus.redis_url import value_without_passwords
-from rmc.common.env.config import PYTHONS, EnvConfig, check_kwargs
+from rmc.common.env.config import EnvConfig, check_kwargs, typed
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.option_names import did_you_mean, flag, flat, option, plain_names, read_toml
 from rmc.deploy.run.presets import robust
@@ -255,12 +255,5 @@ def read_values(text: str) -> list[Any]:
     try:
         values: list[Any] = json.loads(f"[{text}]")
     except ValueError:
-        values = [_value(part) for part in text.split(",")]
+        values = [typed(part) for part in text.split(",")]
     return values
-
-
-def _value(text: str) -> Any:
-    try:
-        return json.loads(text)
-    except ValueError:
-        return PYTHONS.get(text, text)

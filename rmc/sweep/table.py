@@ -6,6 +6,7 @@ import numpy as np
 from rich.table import Table
 
 from rmc.common.return_text import return_text
+from rmc.deploy.monitor.table import plain_table
 from rmc.sweep.index import Index
 from rmc.sweep.job import TRIAL, Job, value_text
 
@@ -20,12 +21,10 @@ def result_table(jobs: Sequence[Job], index: Index) -> Table:
     for runs in points.values():
         by_env.setdefault(runs[0].values.get("env", ""), []).append(_row(runs, index, names))
     rows = [row for each in by_env.values() for row in sorted(each, key=lambda row: -row[0])]
-    table = Table(box=None, pad_edge=False)
     whole = all(not cells[-1] for _, cells in rows)
     columns = ["trial" if jobs[0].is_trial else "", *names, "seeds", "return", "not finished"]
     shown_at = [at for at, name in enumerate(columns) if name and not (whole and name == "not finished")]
-    for at in shown_at:
-        table.add_column(columns[at], justify="right", no_wrap=True)
+    table = plain_table([columns[at] for at in shown_at], columns)
     for _, cells in rows:
         table.add_row(*(cells[at] for at in shown_at))
     return table
