@@ -1,4 +1,4 @@
-"""Deterministic episodes of a policy: what its agent saw, and what was there but hidden from it.
+"""Episodes of an agent as its actors play: what it saw, and what was there but hidden from it.
 
 Shapes: T steps of an episode, O observation, A action, F numbers of the environment's own observation, M flags of what
 is missing, P privileged numbers, S state.
@@ -12,10 +12,12 @@ from typing import Any
 
 import numpy as np
 import torch
+from safetensors.torch import save
 from torch import Tensor
 
 from rmc.actors.evaluator import LONGEST_EPISODE, first_start
-from rmc.analysis.policy import load_policy
+from rmc.analysis.policy import Policy
+from rmc.analysis.policy_file import PolicyFile
 from rmc.common.agent import Agent, MemoryOutput
 from rmc.common.env.config import EnvConfig
 from rmc.common.env.describe import layout_of, visible_slice
@@ -25,7 +27,6 @@ from rmc.common.env.wrappers import CorruptObservation, Delay, Env, FrameStack, 
 from rmc.common.errors import ConfigError
 from rmc.common.window import Doubles, Floats
 from rmc.deploy.run.config import RunConfig
-from rmc.deploy.run.folder import RunFolder
 
 LEAST_EPISODES, MOST_EPISODES = 8, 64  # played to learn about the memory: so many, and until
 ENOUGH_STEPS = 4_000  # are played
@@ -111,11 +112,12 @@ def _name(part: Part, only_missing: bool) -> str:
 
 
 class Player:
-    """Deterministic episodes of a run's policy, one after another; the first starts from the run's seed."""
+    """An agent's episodes with the policy's noise, which its Q is of; the first starts from the run's seed."""
 
-    def __init__(self, folder: RunFolder, agent: Agent, config: RunConfig, checkpoint: str) -> None:
-        """``agent`` gives the normaliser. Raises ConfigError."""
-        self._agent, self._config, self._policy = agent, config, load_policy(folder.path, checkpoint)
+    def __init__(self, agent: Agent, config: RunConfig) -> None:
+        """Raises ConfigError."""
+        self._agent, self._config = agent, config
+        self._policy = Policy(PolicyFile(config.policy_header(), save(agent.policy_weights())), config.seed)
         privileged = agent.privileged_normalizer is not None
         env = make_env(config.env, privileged=True) if privileged else self._policy.make_env()
         self._env, self._record = recorded(env)
@@ -143,7 +145,7 @@ class Player:
         policy.reset()
         observations, own, infos, actions, rewards = [observation], [self._record.newest], [_kept(info)], [], []
         for _ in range(LONGEST_EPISODE if is_first else LONGEST_FURTHER):
-            actions.append(policy.act(observation, info.get("missing", False)))
+            actions.append(policy.act(observation, info.get("missing", False), explore=True))
             observation, reward, terminated, truncated, info = env.step(actions[-1])
             observations.append(observation)
             own.append(self._record.newest)

@@ -8,7 +8,7 @@ from rich.table import Table
 from rmc.analysis.episodes import Episode, HiddenPart
 from rmc.analysis.influence import Influence, influence
 from rmc.analysis.memory_probe import Probe, probes
-from rmc.common.agent import Agent
+from rmc.common.agent import Agent, Memory
 from rmc.deploy.monitor.table import plain_table
 
 if TYPE_CHECKING:
@@ -34,9 +34,9 @@ class MemoryInsight:
         return 1 + bool(self.probes)
 
 
-def examine_memory(agent: Agent, episodes: list[Episode], parts: list[HiddenPart]) -> MemoryInsight:
-    """From several episodes, and what they hide from the agent."""
-    return MemoryInsight(*influence(agent, episodes), probes(agent, episodes, parts))
+def examine_memory(agent: Agent, untrained: Memory, episodes: list[Episode], parts: list[HiddenPart]) -> MemoryInsight:
+    """From several episodes, and what they hide from the agent, whose memory began as ``untrained``."""
+    return MemoryInsight(*influence(agent, episodes), probes(agent, untrained, episodes, parts))
 
 
 def draw(memory: MemoryInsight, axes: "list[Axes]") -> None:
@@ -58,14 +58,16 @@ def draw(memory: MemoryInsight, axes: "list[Axes]") -> None:
 def _draw_probes(of: list[Probe], axis: "Axes") -> None:
     places = range(len(of))
     for offset, label, values, colour in (
-        (-0.2, "from h", [one.from_memory for one in of], "tab:purple"),
-        (0.2, "from the newest observation", [one.from_newest for one in of], "lightgrey"),
+        (-0.27, "from h", [one.from_memory for one in of], "tab:purple"),
+        (0.0, "from h as it began", [one.from_untrained for one in of], "thistle"),
+        (0.27, "from the newest observation", [one.from_newest for one in of], "lightgrey"),
     ):
         lengths = [max(value, LEAST_R2) for value in values]
-        axis.barh([place + offset for place in places], lengths, 0.4, color=colour, label=label)
+        axis.barh([place + offset for place in places], lengths, 0.27, color=colour, label=label)
     axis.set_yticks(list(places), [one.name for one in of], parse_math=False)
     axis.invert_yaxis()
-    axis.set_xlim(LEAST_R2 if any(min(one.from_memory, one.from_newest) < 0.0 for one in of) else 0.0, 1.0)
+    least = min(min(one.from_memory, one.from_untrained, one.from_newest) for one in of)
+    axis.set_xlim(LEAST_R2 if least < 0.0 else 0.0, 1.0)
     axis.set_xlabel("R² of what is hidden, read linearly")
     axis.legend(fontsize="small")
 
@@ -88,7 +90,7 @@ def _influence_table(memory: MemoryInsight) -> Table:
 
 
 def _probe_table(of: list[Probe]) -> Table:
-    table = plain_table(("hidden", "R² from h", "from the newest observation"))
+    table = plain_table(("hidden", "R² from h", "from h as it began", "from the newest observation"))
     for one in of:
-        table.add_row(one.name, *(f"{value:.2f}" for value in (one.from_memory, one.from_newest)))
+        table.add_row(one.name, *(f"{value:.2f}" for value in (one.from_memory, one.from_untrained, one.from_newest)))
     return table

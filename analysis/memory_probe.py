@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from rmc.analysis.episodes import Episode, HiddenPart, unroll_episode
-from rmc.common.agent import Agent
+from rmc.common.agent import Agent, Memory
 from rmc.common.window import BoolArray, Doubles
 
 PENALTIES = (1e-4, 1e-2, 1.0)  # of the squared weights, as shares of the inputs' variance; one is chosen
@@ -27,6 +27,7 @@ class Probe:
 
     name: str
     from_memory: float
+    from_untrained: float  # from the memory as it began: random features tell much, too
     from_newest: float  # from the newest observation that was seen, alone
 
 
@@ -35,6 +36,7 @@ class Samples:
     """Rows of several episodes."""
 
     h: Doubles  # (N, H)
+    untrained: Doubles  # (N, H)
     newest: Doubles  # (N, O), the newest observation that was seen, normalised
     own: Doubles  # (N, F), the environment's own observation
     probe: dict[str, Doubles]  # (N,)
@@ -42,16 +44,23 @@ class Samples:
     quarter: NDArray[np.int64]  # (N,), the same for all steps of an episode
 
 
-def samples(agent: Agent, episodes: list[Episode]) -> Samples:
-    """All steps of all episodes, each with its last observation."""
-    joined = [(index, episode, unroll_episode(agent, episode)[0].hidden[0]) for index, episode in enumerate(episodes)]
+@torch.no_grad()
+def samples(agent: Agent, untrained: Memory, episodes: list[Episode]) -> Samples:
+    """All steps of all episodes, each with its last observation. Both memories read the same, filled by the agent."""
+    h, started = [], []
+    for episode in episodes:
+        remembered, seen = unroll_episode(agent, episode)
+        start = torch.zeros(1, agent.config.hidden)
+        h.append(remembered.hidden[0].double().numpy())
+        started.append(untrained(seen, episode.missing, episode.previous, start).hidden[0].double().numpy())
     return Samples(
-        np.concatenate([h.double().numpy() for _, _, h in joined]),
+        np.concatenate(h),
+        np.concatenate(started),
         np.concatenate([_newest(episode) for episode in episodes]),
         np.concatenate([episode.own for episode in episodes]).astype(np.float64),
         {name: np.concatenate([episode.probe[name] for episode in episodes]) for name in episodes[0].probe},
         np.concatenate([episode.missing[0].numpy() for episode in episodes]),
-        np.concatenate([np.full(len(h), index % QUARTERS) for index, _, h in joined]),
+        np.concatenate([np.full(len(states), index % QUARTERS) for index, states in enumerate(h)]),
     )
 
 
@@ -63,9 +72,9 @@ def _newest(episode: Episode) -> Doubles:
     return newest
 
 
-def probes(agent: Agent, episodes: list[Episode], parts: list[HiddenPart]) -> list[Probe]:
+def probes(agent: Agent, untrained: Memory, episodes: list[Episode], parts: list[HiddenPart]) -> list[Probe]:
     """Of each hidden part and of what the environment says; what never changes is left out."""
-    rows = samples(agent, episodes)
+    rows = samples(agent, untrained, episodes)
     every = np.ones(len(rows.h), np.bool_)
     read = [
         _of_part(rows, part) if part.only_missing else _probe(part.name, rows, rows.own[:, part.columns], every)
@@ -86,10 +95,8 @@ def _of_part(rows: Samples, part: HiddenPart) -> Probe | None:
     found = [probe for probe in each if probe is not None]
     if not found:
         return None
-    return Probe(
-        part.name,
-        *(fmean(values) for values in zip(*((one.from_memory, one.from_newest) for one in found), strict=True)),
-    )
+    each_from = zip(*((one.from_memory, one.from_untrained, one.from_newest) for one in found), strict=True)
+    return Probe(part.name, *map(fmean, each_from))
 
 
 def _probe(name: str, rows: Samples, y: Doubles, at: BoolArray) -> Probe | None:
@@ -101,8 +108,8 @@ def _probe(name: str, rows: Samples, y: Doubles, at: BoolArray) -> Probe | None:
     y = y[:, y[quarter < 2].std(0) > LEAST_SPREAD]
     if not y.size:
         return None
-    from_memory, from_newest = (explained(x[at], y, quarter) for x in (rows.h, rows.newest))
-    return Probe(name, from_memory, from_newest) if isfinite(from_memory) else None
+    found = [explained(x[at], y, quarter) for x in (rows.h, rows.untrained, rows.newest)]
+    return Probe(name, *found) if isfinite(found[0]) else None
 
 
 def explained(x: Doubles, y: Doubles, quarter: NDArray[np.int64]) -> float:

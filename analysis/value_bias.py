@@ -18,7 +18,7 @@ HORIZONS = 3.0  # of 1 / (1 - gamma) steps, left out at a cut: 5 % of a return i
 
 @dataclass(frozen=True)
 class ValueBias:
-    """Means over steps of deterministic episodes, in the environment's rewards."""
+    """Means over steps of the agent's own episodes, in the environment's rewards."""
 
     expected: float  # Q of the action taken, mean of both critics
     came: float  # discounted rewards and entropy bonuses, as Q counts them

@@ -18,12 +18,12 @@ from rmc.analysis.episodes import Episode, Player, unroll_episode
 from rmc.analysis.memory_picture import MemoryInsight, examine_memory
 from rmc.analysis.out_file import PICTURES, check_writable
 from rmc.analysis.value_bias import ValueBias, value_bias
-from rmc.common.agent import Agent, MemoryOutput
+from rmc.common.agent import Agent, MemoryOutput, initial_agent
 from rmc.common.checkpoint import STATE
 from rmc.common.errors import ConfigError, first_line
 from rmc.common.extra import check_installed
 from rmc.common.window import Floats
-from rmc.deploy.run.checkpoint_choice import checkpoint_number, choose_checkpoint
+from rmc.deploy.run.checkpoint_choice import choose_checkpoint
 from rmc.deploy.run.config import RunConfig
 from rmc.deploy.run.folder import RunFolder
 from rmc.deploy.run.validation import validate
@@ -55,12 +55,12 @@ def load_agent(folder: RunFolder, config: RunConfig, checkpoint: str) -> Agent:
     spec = config.window_spec()
     folder.check_sizes(config.env.id, config.sizes())
     agent = Agent(spec.obs_dim, spec.action_dim, config.agent, spec.missing, spec.privileged)
-    files = choose_checkpoint(folder, checkpoint)[1]
+    number, files = choose_checkpoint(folder, checkpoint)
     try:
         agent.load_state_dict(read_state(files, torch.device("cpu"))["agent"])
     except NOT_OURS as error:
         fix = f"its {STATE} is not this run's ({first_line(error)}); use another"
-        raise ConfigError("--checkpoint", checkpoint, fix) from None
+        raise ConfigError("--checkpoint", str(number), fix) from None
     return agent.eval()
 
 
@@ -123,12 +123,13 @@ def inspect(run: Path, checkpoint: str, out: Path) -> tuple[Insight, MemoryInsig
     check_installed("plot", ("matplotlib",), "--out", str(out))
     check_writable("--out", out, PICTURES)
     folder = RunFolder(run)
-    config, agent, number = _grounded(folder, checkpoint)
-    with closing(Player(folder, agent, config, number)) as player:
+    config, agent = _grounded(folder, checkpoint)
+    with closing(Player(agent, config)) as player:
         episodes, hidden = player.several(), player.hidden_parts()
     scale = config.actor.reward_scale
     insight = look(agent, episodes[0], config.update.model_norm, scale)
-    memory = examine_memory(agent, episodes, hidden)
+    untrained = initial_agent(config.window_spec(), config.agent, config.seed).memory
+    memory = examine_memory(agent, untrained, episodes, hidden)
     draw(insight, _title(config), out, memory)
     value = value_bias(agent, episodes, config.update.gamma, scale) if config.update.n_step == 1 else None
     return insight, memory, value
@@ -136,21 +137,19 @@ def inspect(run: Path, checkpoint: str, out: Path) -> tuple[Insight, MemoryInsig
 
 def inspect_to(folder: RunFolder, checkpoint: str, out: BinaryIO) -> Insight:
     """Play one episode, look, and write the picture as PNG to what is like a file. Raises ConfigError."""
-    config, agent, number = _grounded(folder, checkpoint)
-    with closing(Player(folder, agent, config, number)) as player:
+    config, agent = _grounded(folder, checkpoint)
+    with closing(Player(agent, config)) as player:
         insight = look(agent, player.play(), config.update.model_norm, config.actor.reward_scale)
     draw(insight, _title(config), out)
     return insight
 
 
-def _grounded(folder: RunFolder, checkpoint: str) -> tuple[RunConfig, Agent, str]:
-    """And the checkpoint's number: a run in training goes on to others."""
+def _grounded(folder: RunFolder, checkpoint: str) -> tuple[RunConfig, Agent]:
     config = folder.config()
     if not config.agent.grounding:
         fix = "its world model predicts no observations; train with --grounding"
         raise ConfigError("RUN", str(folder.path), fix)
-    number = str(checkpoint_number(folder, checkpoint))
-    return config, load_agent(folder, config, number), number
+    return config, load_agent(folder, config, checkpoint)
 
 
 def _title(config: RunConfig) -> str:

@@ -24,7 +24,7 @@ from rmc.common.env.make import make_env
 from rmc.common.errors import ConfigError
 from rmc.deploy.run.config import RunConfig
 from tests.memory_env import MemoryEnv
-from tests.runs import AGENTS, run_of
+from tests.runs import AGENTS
 
 PLAIN = AgentConfig(hidden=4, embedding=0, heads=(10, 9))
 MEMORY = RunConfig(env=EnvConfig("tests.memory_env:Memory12-v0"), preset="debug", agent=PLAIN)
@@ -44,14 +44,14 @@ def built(gate: float) -> Agent:
     return agent.eval()
 
 
-def played(config: RunConfig, agent: Agent, path: Path) -> tuple[list[Episode], list[HiddenPart]]:
-    with closing(Player(run_of(path, config), agent, config, "latest")) as player:
+def played(config: RunConfig, agent: Agent) -> tuple[list[Episode], list[HiddenPart]]:
+    with closing(Player(agent, config)) as player:
         return player.several(), player.hidden_parts()
 
 
 @pytest.fixture(scope="module")
-def of_memory_env(tmp_path_factory: pytest.TempPathFactory) -> list[Episode]:
-    return played(MEMORY, built(ASLEEP), tmp_path_factory.mktemp("run") / "run")[0]
+def of_memory_env() -> list[Episode]:
+    return played(MEMORY, built(ASLEEP))[0]
 
 
 def test_a_memory_that_holds_its_input_shows_it_at_every_delay_and_one_that_does_not_at_none(
@@ -60,7 +60,7 @@ def test_a_memory_that_holds_its_input_shows_it_at_every_delay_and_one_that_does
     holds, forgets = (influence(built(gate), of_memory_env) for gate in (ASLEEP, AWAKE))
     assert holds[0].delays == forgets[0].delays == (1, 2, 3, 5, 7, 10, 15)  # of 16 steps
     for one in holds[0].changes.values():
-        assert (one > 0.02).all()
+        assert (one > 0.005).all()
         assert one[-1] > 0.8 * one[0]
     for kept, gone in zip(holds, forgets, strict=True):
         assert kept.delays
@@ -69,10 +69,13 @@ def test_a_memory_that_holds_its_input_shows_it_at_every_delay_and_one_that_does
 
 
 def test_the_cue_can_be_read_out_of_the_memory_that_holds_it(of_memory_env: list[Episode]) -> None:
-    (held,), (gone,) = (probes(built(gate), of_memory_env, []) for gate in (ASLEEP, AWAKE))
+    holds, forgets = built(ASLEEP), built(AWAKE)
+    (held,) = probes(holds, forgets.memory, of_memory_env, [])
+    (gone,) = probes(forgets, holds.memory, of_memory_env, [])
     assert held.name == gone.name == "cue"
-    assert held.from_memory > 0.9
-    assert max(gone.from_memory, held.from_newest, gone.from_newest) < 0.3  # seen in one step of 17
+    assert min(held.from_memory, gone.from_untrained) > 0.9
+    # what is forgotten was seen in one step of 17
+    assert max(gone.from_memory, held.from_untrained, held.from_newest, gone.from_newest) < 0.3
     assert len(of_memory_env) == 64
 
 
@@ -81,10 +84,9 @@ def test_differences_are_those_of_two_whole_passes(agent: str, tmp_path: Path) -
     """From the state before the change on, or over the whole episode: the same."""
     env = EnvConfig("Pendulum-v1", flicker=0.3, time_limit=30)
     config = RunConfig(env, preset="debug", seed=4, agent=AGENTS[agent])
-    folder = run_of(tmp_path / "run", config)
     torch.manual_seed(0)
     network = Agent(3, 1, config.agent).eval()
-    with closing(Player(folder, network, config, "latest")) as player:
+    with closing(Player(network, config)) as player:
         episode = player.play()
     replay, delays = ReplayedEpisode(network, episode), torch.tensor([0, 1, 4, 9])
     starts = [start for start in (0, 1, 5, 8, 13, 19) if not episode.missing[0, start]]
@@ -164,7 +166,7 @@ def test_a_sensor_that_fails_alone_is_read_where_it_failed() -> None:
     noise, missing = rng.normal(size=(rows, 3)), rng.random((rows, 3)) < 0.3
     newest, quarter = np.where(missing, 0.0, noise), np.arange(rows) % 4
     parts = HiddenPart("noise, where missing", slice(0, 3), True, slice(0, 3))
-    found = _of_part(Samples(newest, newest, noise, {}, missing, quarter), parts)
+    found = _of_part(Samples(newest, newest, newest, noise, {}, missing, quarter), parts)
     assert found is not None
     assert max(found.from_memory, found.from_newest) < 0.02
 
@@ -172,8 +174,9 @@ def test_a_sensor_that_fails_alone_is_read_where_it_failed() -> None:
 def test_rows_are_the_memory_beside_what_was_seen_last(tmp_path: Path) -> None:
     config = RunConfig(EnvConfig("Pendulum-v1", flicker=0.5, time_limit=40), preset="debug", agent=AGENTS["robust"])
     agent = Agent(3, 1, config.agent).eval()
-    episodes, parts = played(config, agent, tmp_path / "run")
-    rows, at = samples(agent, episodes), 0
+    episodes, parts = played(config, agent)
+    rows, at = samples(agent, agent.memory, episodes), 0
+    np.testing.assert_allclose(rows.untrained, rows.h, atol=1e-5)  # the same memory, along the same filled frames
     for index, episode in enumerate(episodes):
         newest, memory = np.zeros(3), unroll_episode(agent, episode)[0].hidden[0]
         for t in range(41):
@@ -184,10 +187,10 @@ def test_rows_are_the_memory_beside_what_was_seen_last(tmp_path: Path) -> None:
             np.testing.assert_array_equal(rows.own[at], episode.own[t])
             assert (rows.missing[at], rows.quarter[at]) == (bool(episode.missing[0, t]), index % 4)
             at += 1
-    (probe,) = probes(agent, episodes, parts)
+    (probe,) = probes(agent, agent.memory, episodes, parts)
     wrong = dataclasses.replace(parts[0], columns=slice(0, 0))
     assert probe.name == "observation, where missing"
-    assert probes(agent, episodes, [wrong]) == []
+    assert probes(agent, agent.memory, episodes, [wrong]) == []
 
 
 def test_what_is_missing_is_not_changed(of_memory_env: list[Episode]) -> None:
@@ -209,7 +212,7 @@ def test_what_the_environment_itself_lacks_is_not_read_out() -> None:
     own[::3] = np.nan
     every = np.ones((rows, 1), np.bool_)
     found = _of_part(
-        Samples(h, np.zeros((rows, 1)), own, {}, every, quarter), HiddenPart("x", slice(0, 2), True, slice(0, 1))
+        Samples(h, h, np.zeros((rows, 1)), own, {}, every, quarter), HiddenPart("x", slice(0, 2), True, slice(0, 1))
     )
     assert found is not None
     assert found.from_memory > 0.99
@@ -247,8 +250,7 @@ gym.register("Told-v0", Told)
 def test_a_probe_that_is_no_dict_of_the_same_numbers_is_named(probe: Any, tmp_path: Path) -> None:
     env = EnvConfig("tests.analysis.test_memory_picture:Told-v0", env_kwargs={"probe": 1.0})
     config = dataclasses.replace(MEMORY, env=env)
-    folder = run_of(tmp_path / "run", config)
-    player = Player(folder, built(ASLEEP), config, "latest")
+    player = Player(built(ASLEEP), config)
     player._env.unwrapped._probe = probe  # type: ignore[attr-defined]
     with closing(player), pytest.raises(ConfigError, match=r'its info\["probe"\] is .*; return a dict of the same'):
         player.play()
@@ -272,7 +274,7 @@ gym.register("Reuses-v0", Reuses, kwargs={"delay": 3})
 
 def test_a_probe_is_read_at_its_step(tmp_path: Path) -> None:
     config = dataclasses.replace(MEMORY, env=EnvConfig("tests.analysis.test_memory_picture:Reuses-v0"))
-    with closing(Player(run_of(tmp_path / "run", config), built(ASLEEP), config, "latest")) as player:
+    with closing(Player(built(ASLEEP), config)) as player:
         steps = player.play().probe["step"]
     assert steps.tolist() == list(range(len(steps)))
 
@@ -296,9 +298,8 @@ gym.register("Changing-v0", Changing, kwargs={"delay": 3})
 
 def test_a_probe_with_other_names_in_each_episode_is_named(tmp_path: Path) -> None:
     config = dataclasses.replace(MEMORY, env=EnvConfig("tests.analysis.test_memory_picture:Changing-v0"))
-    folder = run_of(tmp_path / "run", config)
     with (
-        closing(Player(folder, built(ASLEEP), config, "latest")) as player,
+        closing(Player(built(ASLEEP), config)) as player,
         pytest.raises(ConfigError, match=r"names \['object \d'\], then others; return the same names in every episode"),
     ):
         player.several()
@@ -307,7 +308,7 @@ def test_a_probe_with_other_names_in_each_episode_is_named(tmp_path: Path) -> No
 def test_both_are_shown_in_panels_and_tables(of_memory_env: list[Episode]) -> None:
     from matplotlib.figure import Figure
 
-    memory = examine_memory(built(ASLEEP), of_memory_env, [])
+    memory = examine_memory(built(ASLEEP), built(AWAKE).memory, of_memory_env, [])
     axes = list(Figure().subplots(memory.panels, 1))
     memory_picture.draw(memory, axes)
     assert {line.get_label() for line in axes[0].lines} >= {"h, first observation", "action, later observation"}
