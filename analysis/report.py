@@ -59,7 +59,7 @@ def write_report(runs: Sequence[ReportRun], out: Path, with_video: bool) -> None
     }
     template = files("rmc.analysis").joinpath("report.html").read_text(encoding="utf-8")
     page_template = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(template)
-    write_whole(out, page_template.render(page).encode())
+    write_whole(out, page_template.render(page).encode(errors="replace"))  # of a folder's name that is no UTF-8
 
 
 def newest(runs: Sequence[ReportRun]) -> list[ReportRun]:

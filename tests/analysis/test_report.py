@@ -1,6 +1,7 @@
 """rmc report: one page that a real browser shows without a network, of every kind of run."""
 
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -284,6 +285,12 @@ def test_film_and_rollouts_are_of_one_checkpoint(
     assert (len(read), len(set(read))) == (2, 1)  # the world model's and the film's
     saves = 4
     assert "data:video/mp4" in written(tmp_path / "report.html", str(path))
+
+
+def test_a_folder_whose_name_is_no_text_is_reported(trained: Path, tmp_path: Path) -> None:
+    odd = tmp_path / os.fsdecode(b"run-\xff")
+    shutil.copytree(trained, odd)
+    assert "run-?" in written(tmp_path / "report.html", "--no-video", str(odd))
 
 
 def test_a_baseline_stands_beside_a_run(trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
