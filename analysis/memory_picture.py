@@ -35,7 +35,7 @@ class MemoryInsight:
 
 
 def examine_memory(agent: Agent, untrained: Memory, episodes: list[Episode], parts: list[HiddenPart]) -> MemoryInsight:
-    """From several episodes, and what they hide from the agent, whose memory began as ``untrained``."""
+    """From several episodes, and what they hide from the agent, beside a memory that never learnt."""
     return MemoryInsight(*influence(agent, episodes), probes(agent, untrained, episodes, parts))
 
 
@@ -59,7 +59,7 @@ def _draw_probes(of: list[Probe], axis: "Axes") -> None:
     places = range(len(of))
     for offset, label, values, colour in (
         (-0.27, "from h", [one.from_memory for one in of], "tab:purple"),
-        (0.0, "from h as it began", [one.from_untrained for one in of], "thistle"),
+        (0.0, "from an untrained h", [one.from_untrained for one in of], "thistle"),
         (0.27, "from the newest observation", [one.from_newest for one in of], "lightgrey"),
     ):
         lengths = [max(value, LEAST_R2) for value in values]
@@ -90,7 +90,7 @@ def _influence_table(memory: MemoryInsight) -> Table:
 
 
 def _probe_table(of: list[Probe]) -> Table:
-    table = plain_table(("hidden", "R² from h", "from h as it began", "from the newest observation"))
+    table = plain_table(("hidden", "R² from h", "from an untrained h", "from the newest observation"))
     for one in of:
         table.add_row(one.name, *(f"{value:.2f}" for value in (one.from_memory, one.from_untrained, one.from_newest)))
     return table

@@ -27,7 +27,7 @@ class Probe:
 
     name: str
     from_memory: float
-    from_untrained: float  # from the memory as it began: random features tell much, too
+    from_untrained: float  # from a memory that never learnt: random features tell much, too
     from_newest: float  # from the newest observation that was seen, alone
 
 

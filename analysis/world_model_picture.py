@@ -58,6 +58,8 @@ def load_agent(folder: RunFolder, config: RunConfig, checkpoint: str) -> Agent:
     number, files = choose_checkpoint(folder, checkpoint)
     try:
         agent.load_state_dict(read_state(files, torch.device("cpu"))["agent"])
+        if not all(value.isfinite().all() for value in agent.state_dict().values()):
+            raise ValueError("it is not finite")
     except NOT_OURS as error:
         fix = f"its {STATE} is not this run's ({first_line(error)}); use another"
         raise ConfigError("--checkpoint", str(number), fix) from None

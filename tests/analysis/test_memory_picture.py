@@ -3,7 +3,6 @@
 import dataclasses
 import io
 from contextlib import closing
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -80,7 +79,7 @@ def test_the_cue_can_be_read_out_of_the_memory_that_holds_it(of_memory_env: list
 
 
 @pytest.mark.parametrize("agent", ["robust", "filling blanks", "observation beside", "without a memory"])
-def test_differences_are_those_of_two_whole_passes(agent: str, tmp_path: Path) -> None:
+def test_differences_are_those_of_two_whole_passes(agent: str) -> None:
     """From the state before the change on, or over the whole episode: the same."""
     env = EnvConfig("Pendulum-v1", flicker=0.3, time_limit=30)
     config = RunConfig(env, preset="debug", seed=4, agent=AGENTS[agent])
@@ -171,7 +170,7 @@ def test_a_sensor_that_fails_alone_is_read_where_it_failed() -> None:
     assert max(found.from_memory, found.from_newest) < 0.02
 
 
-def test_rows_are_the_memory_beside_what_was_seen_last(tmp_path: Path) -> None:
+def test_rows_are_the_memory_beside_what_was_seen_last() -> None:
     config = RunConfig(EnvConfig("Pendulum-v1", flicker=0.5, time_limit=40), preset="debug", agent=AGENTS["robust"])
     agent = Agent(3, 1, config.agent).eval()
     episodes, parts = played(config, agent)
@@ -247,7 +246,7 @@ gym.register("Told-v0", Told)
 
 
 @pytest.mark.parametrize("probe", ["x", {}, {"cue": "x"}, {"cue": None}, {"cue": float("nan")}, {"goal": 1.0}], ids=str)
-def test_a_probe_that_is_no_dict_of_the_same_numbers_is_named(probe: Any, tmp_path: Path) -> None:
+def test_a_probe_that_is_no_dict_of_the_same_numbers_is_named(probe: Any) -> None:
     env = EnvConfig("tests.analysis.test_memory_picture:Told-v0", env_kwargs={"probe": 1.0})
     config = dataclasses.replace(MEMORY, env=env)
     player = Player(built(ASLEEP), config)
@@ -272,7 +271,7 @@ class Reuses(MemoryEnv):
 gym.register("Reuses-v0", Reuses, kwargs={"delay": 3})
 
 
-def test_a_probe_is_read_at_its_step(tmp_path: Path) -> None:
+def test_a_probe_is_read_at_its_step() -> None:
     config = dataclasses.replace(MEMORY, env=EnvConfig("tests.analysis.test_memory_picture:Reuses-v0"))
     with closing(Player(built(ASLEEP), config)) as player:
         steps = player.play().probe["step"]
@@ -296,7 +295,7 @@ class Changing(MemoryEnv):
 gym.register("Changing-v0", Changing, kwargs={"delay": 3})
 
 
-def test_a_probe_with_other_names_in_each_episode_is_named(tmp_path: Path) -> None:
+def test_a_probe_with_other_names_in_each_episode_is_named() -> None:
     config = dataclasses.replace(MEMORY, env=EnvConfig("tests.analysis.test_memory_picture:Changing-v0"))
     with (
         closing(Player(built(ASLEEP), config)) as player,

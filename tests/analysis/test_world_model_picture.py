@@ -4,16 +4,19 @@ import dataclasses
 import io
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from rmc.analysis import episodes
+from rmc.analysis import episodes, world_model_picture
 from rmc.analysis.episodes import Episode, Player
+from rmc.analysis.influence import ReplayedEpisode
+from rmc.analysis.memory_picture import MemoryInsight, examine_memory
 from rmc.analysis.world_model_picture import HORIZONS, inspect, load_agent, look
 from rmc.cli import main
-from rmc.common.agent import Agent
+from rmc.common.agent import Agent, Memory, initial_agent
 from rmc.common.checkpoint import CheckpointFolder
 from rmc.common.env.config import EnvConfig
 from rmc.common.errors import ConfigError
@@ -74,6 +77,33 @@ def test_rollouts_are_those_of_a_plain_loop(config: RunConfig, tmp_path: Path) -
     np.testing.assert_allclose(insight.unexplained, error / change, rtol=1e-4)
 
 
+def test_episodes_are_played_by_the_agents_own_weights_and_with_noise(config: RunConfig, tmp_path: Path) -> None:
+    agent = load_agent(run_of(tmp_path / "run", config), config, "latest")
+    with torch.no_grad():
+        agent.policy.net[-1].bias += 1.0  # type: ignore[operator]  # not as it was saved
+        episode = Player(agent, config).play()
+        mean, log_std = agent.policy(ReplayedEpisode(agent, episode).features)
+    noise = (torch.atanh(episode.action) - mean) / log_std.exp()
+    assert abs(noise.mean()) < 0.6  # of 40 steps
+    assert 0.6 < noise.std() < 1.4
+
+
+def test_a_memory_that_never_learnt_is_looked_at_beside(
+    config: RunConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = []
+
+    def examine(agent: Agent, untrained: Memory, *of: Any) -> MemoryInsight:
+        given.append(untrained.state_dict())
+        return examine_memory(agent, untrained, *of)
+
+    monkeypatch.setattr(world_model_picture, "examine_memory", examine)
+    inspect(run_of(tmp_path / "run", config).path, "latest", tmp_path / "seen.png")
+    torch.testing.assert_close(
+        given, [initial_agent(config.window_spec(), config.agent, config.seed).memory.state_dict()]
+    )
+
+
 @of_three_agents
 def test_the_command_writes_a_picture_and_says_it_in_numbers(
     config: RunConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -91,6 +121,18 @@ def test_the_command_writes_a_picture_and_says_it_in_numbers(
     words = ["inspect", str(folder.path), "--out"]
     assert "its folder is not there" in complaint([*words, str(tmp_path / "no" / "seen.png")], capsys)
     assert "ends in .png" in complaint([*words, str(tmp_path / "seen.xyz")], capsys)
+
+
+def test_weights_that_are_not_finite_are_no_agents(config: RunConfig, tmp_path: Path) -> None:
+    folder = run_of(tmp_path / "run", config)
+    agent = load_agent(folder, config, "latest")
+    agent.log_alpha.data.fill_(torch.nan)
+    state = io.BytesIO()
+    torch.save({"agent": agent.state_dict()}, state)
+    checkpoints = CheckpointFolder(folder.checkpoints)
+    checkpoints.save(8, {**checkpoints.load(7), "learner.pt": state.getvalue()})
+    with pytest.raises(ConfigError, match=r"--checkpoint='8': its learner.pt .*not finite.*; use another"):
+        load_agent(folder, config, "latest")
 
 
 def test_an_episode_of_one_step_is_drawn(config: RunConfig, tmp_path: Path) -> None:

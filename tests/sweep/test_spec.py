@@ -94,6 +94,7 @@ def test_values() -> None:
     assert read_values("l1,l2") == ["l1", "l2"]
     assert read_values("true,l2,3") == [True, "l2", 3]
     assert read_values("False,True") == [False, True]
+    assert read_values(".5,l2") == [0.5, "l2"]  # as --env-kwargs reads it
     assert read_values("[64,64],[8]") == [[64, 64], [8]]
 
 
