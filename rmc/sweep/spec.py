@@ -84,15 +84,15 @@ class Spec:
         if self.search is not None:
             self._check_search(self.search)
         varied = {**self.grid, **(self.search.ranges if self.search else {})}
-        typed = [word.lstrip("-").partition("=")[0].replace("-", "_") for word in self.words if word.startswith("--")]
-        for name in [*self.options, *typed]:
+        given = [word.lstrip("-").partition("=")[0].replace("-", "_") for word in self.words if word.startswith("--")]
+        for name in [*self.options, *given]:
             if (plain := name.removeprefix("no_")) in varied:
                 raise ConfigError(name, varied[plain], "is an option of every run and varied, too; leave one of them")
 
     def said(self) -> set[str]:
         """The options that are typed, that every run has, or that are varied."""
-        typed = set(map(flag, self.words))
-        return typed.union(map(option, (*self.options, *self.grid, *(self.search.ranges if self.search else {}))))
+        varied = self.search.ranges if self.search else {}
+        return {*map(flag, self.words), *map(option, (*self.options, *self.grid, *varied))}
 
     def _check_search(self, search: Search) -> None:
         if self.grid:
