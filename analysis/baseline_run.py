@@ -5,13 +5,14 @@ import time
 from contextlib import closing, suppress
 from typing import Any
 
+import torch
 from rich.console import Console
 from stable_baselines3.common.callbacks import BaseCallback
 
 from rmc.actors.config import EvaluatorConfig
 from rmc.actors.evaluator import Rollout, evaluation_record, first_start, play_episodes
 from rmc.analysis.baseline_model import BaselineModel
-from rmc.analysis.baseline_settings import BaselineConfig
+from rmc.analysis.baseline_settings import OFF_POLICY, BaselineConfig
 from rmc.analysis.evaluation import FINAL_EPISODES, EvaluationProgress, missing_shares
 from rmc.common.env.make import make_env
 from rmc.common.process.role import StopSignal
@@ -22,6 +23,7 @@ from rmc.deploy.monitor.metrics_log import MetricsLog
 from rmc.deploy.run.folder import ROOM_SECONDS, RunFolder, read_object
 from rmc.deploy.run.metrics_tail import MetricsTail, wall_seconds
 from rmc.deploy.run.option_names import flat
+from rmc.learner.precision import has_fast_bf16
 
 SAVE_SECONDS = 120.0  # between states that can be gone on with: a replay buffer is large
 RECORD_SECONDS = 5.0
@@ -40,6 +42,8 @@ class BaselineRun(BaseCallback):
         super().__init__()
         self.config, self.folder, self._console, self._stop = config, folder, console, stop
         self._model = model
+        rounds = config.precision == "auto" and config.algorithm in OFF_POLICY  # on-policy ones gain nothing
+        self._update_precision = "medium" if rounds and has_fast_bf16(torch.device("cpu")) else "highest"
         self._full = False  # the disk, when it was saved last
         self._record_at = math.inf
         self._next_evaluation = self._after(min(self.steps, evaluated_steps(folder)))  # one that was cut is made up
@@ -68,6 +72,15 @@ class BaselineRun(BaseCallback):
 
     def close(self) -> None:
         self._metrics.close()
+
+    def _on_rollout_start(self) -> None:
+        torch.set_float32_matmul_precision("highest")  # what acts, and is evaluated, rounds nothing
+
+    def _on_rollout_end(self) -> None:
+        torch.set_float32_matmul_precision(self._update_precision)  # medium: products of bfloat16, as our learner's
+
+    def _on_training_end(self) -> None:
+        self._on_rollout_start()
 
     def _on_step(self) -> bool:
         now = time.monotonic()

@@ -15,9 +15,11 @@ from rmc.deploy.run.option_names import option
 
 Algorithm = Literal["sac", "crossq", "td3", "ddpg", "ppo", "recurrent-ppo"]
 Settings = Literal["paper", "zoo", "default"]
+Precision = Literal["auto", "fp32"]
 PAPER_NET = [400, 300]
 OFF_POLICY = ("sac", "crossq", "td3", "ddpg")
 NAMES = {"crossq": "CrossQ", "recurrent-ppo": "RecurrentPPO"}
+BEFORE = {"precision": "fp32"}  # of a run that began before there was a choice
 NOISE = 0.1  # of TD3's and DDPG's actions, where the zoo explores by Gaussian noise
 
 _LEARNING_STARTS = {"learning_starts": 10_000}
@@ -61,6 +63,8 @@ class BaselineConfig:
     """Episodes of an evaluation."""
     threads: int = 1
     """CPU threads of the run."""
+    precision: Precision = "auto"
+    """Of an update's matrix products. auto: bfloat16 for off-policy agents, where the CPU has instructions for it."""
 
     @property
     def name(self) -> str:
@@ -73,6 +77,7 @@ def read_config(folder: RunFolder) -> BaselineConfig:
     """A baseline's config from its folder. Raises ConfigError."""
     raw = folder.settings()
     try:
+        raw = BEFORE | raw
         config = from_dict(BaselineConfig, {item.name: raw[item.name] for item in fields(BaselineConfig)}, "")
         validate(config)
     except (KeyError, ConfigError) as error:

@@ -32,7 +32,7 @@ from rmc.deploy.run.starts import note_start, resume_command
 from rmc.deploy.run.state import remedy
 from rmc.deploy.run.validation import validate_new_env
 
-MAY_CHANGE = {"total_steps", "threads", "checkpoint_steps", "episodes", "env.env_timeout"}
+MAY_CHANGE = {"total_steps", "threads", "precision", "checkpoint_steps", "episodes", "env.env_timeout"}
 Changes = dict[str, list[Any]]  # by the option's path, what it was and is
 
 

@@ -133,6 +133,36 @@ def test_it_speaks_while_it_plays(tmp_path, monkeypatch):
     assert wall_seconds(folder.metrics) <= result["wall_s"]  # without the last evaluation
 
 
+@pytest.mark.parametrize(
+    ("algorithm", "precision", "fast", "rounded"),
+    [
+        ("sac", "auto", True, "medium"), ("td3", "auto", True, "medium"), ("sac", "auto", False, "highest"),
+        ("sac", "fp32", True, "highest"), ("ppo", "auto", True, "highest"),
+    ],
+)  # fmt: skip
+def test_only_an_update_rounds_its_products(algorithm, precision, fast, rounded, tmp_path, monkeypatch):
+    seen = {"train": set(), "play": set()}
+
+    class Watched(baselines.BaselineModel):
+        def __init__(self, *arguments):
+            super().__init__(*arguments)
+            train = self.sb3.train
+            self.sb3.train = lambda *arguments, **named: note("train") or train(*arguments, **named)
+
+        def player(self):
+            note("play")
+            return super().player()
+
+    def note(kind):
+        seen[kind].add(torch.get_float32_matmul_precision())
+
+    monkeypatch.setattr(baselines, "BaselineModel", Watched)
+    monkeypatch.setattr(baseline_run, "has_fast_bf16", lambda _: fast)
+    assert run(config(algorithm, precision=precision), tmp_path / "run") == 0
+    assert seen == {"train": {rounded}, "play": {"highest"}}
+    assert torch.get_float32_matmul_precision() == "highest"
+
+
 def test_tensorboard_draws_its_evaluations(finished):
     events = EventAccumulator(str(finished)).Reload().Scalars("Main/evaluation_return")
     records = [record for record in RunFolder(finished).records() if record["role"] == "evaluator"]
@@ -193,13 +223,13 @@ def test_rmc_resume_goes_on_with_it(tmp_path, capsys):
     (printed,) = re.findall(r"to go on:\n  rmc (.*)\n", capsys.readouterr().out)
     raw = json.loads((folder / "config.json").read_bytes())
     assert raw.pop("format") == FORMAT
-    del raw["env"]["env_kwargs"]
+    del raw["env"]["env_kwargs"], raw["precision"]
     (folder / "config.json").write_text(json.dumps(raw))
     (folder / "history.jsonl").unlink()
     assert rmc([*printed.split(), "--total-steps", "250", "--episodes", "2"]) == 0
     result = RunFolder(folder).result()
     assert (result["env_steps"], result["eval_flicker"]) == (250, 0.5)
-    assert read_config(RunFolder(folder)) == dataclasses.replace(settings, total_steps=250, episodes=2)
+    assert read_config(RunFolder(folder)) == dataclasses.replace(settings, total_steps=250, episodes=2, precision="fp32")
     (start,) = starts(RunFolder(folder))
     assert (start.env_steps, start.changes) == (1, {"total_steps": [300, 250], "episodes": [5, 2]})
     assert json.loads((folder / "config.json").read_bytes())["format"] == FORMAT

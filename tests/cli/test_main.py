@@ -76,7 +76,7 @@ OTHER_FLAGS = {
     "check-env": [*ENV_FLAGS, "--steps"],
     "baseline": [
         *ENV_FLAGS,
-        *"--settings --seed --total-steps --checkpoint-steps --episodes --threads --run-dir".split(),  # noqa: SIM905
+        *"--settings --seed --total-steps --checkpoint-steps --episodes --threads --precision --run-dir".split(),  # noqa: SIM905
     ],
     "plot": ["--out", "--by", "--reference"],
     "report": ["--out", "--video"],
