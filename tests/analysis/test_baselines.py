@@ -229,7 +229,8 @@ def test_rmc_resume_goes_on_with_it(tmp_path, capsys):
     assert rmc([*printed.split(), "--total-steps", "250", "--episodes", "2"]) == 0
     result = RunFolder(folder).result()
     assert (result["env_steps"], result["eval_flicker"]) == (250, 0.5)
-    assert read_config(RunFolder(folder)) == dataclasses.replace(settings, total_steps=250, episodes=2, precision="fp32")
+    now = dataclasses.replace(settings, total_steps=250, episodes=2, precision="fp32")
+    assert read_config(RunFolder(folder)) == now
     (start,) = starts(RunFolder(folder))
     assert (start.env_steps, start.changes) == (1, {"total_steps": [300, 250], "episodes": [5, 2]})
     assert json.loads((folder / "config.json").read_bytes())["format"] == FORMAT
