@@ -186,8 +186,8 @@ def test_the_environment_of_the_docs_can_be_checked_and_trained_on(tmp_path: Pat
 def test_the_docs_name_options_that_exist() -> None:
     there = {flag for flags in (TRAIN_FLAGS, *OTHER_FLAGS.values()) for flag in flags}
     there |= {
-        "--cap-drop", "--exclude", "--find-links", "--generate", "--logdir", "--network", "--no-restart", "--node-ip-address",
-        "--read-only", "--rm", "--shm-size", "--user",
+        "--cap-drop", "--exclude", "--find-links", "--generate", "--logdir", "--network", "--no-restart",
+        "--node-ip-address", "--read-only", "--rm", "--shm-size", "--user",
     }  # fmt: skip  # of others
     switches = [
         path for path, value in flat(presets.debug(EnvConfig("Pendulum-v1"))).items() if isinstance(value, bool)
